@@ -1,0 +1,198 @@
+"""The half buffers of one frame: shapes and values are checked and repaired once, here."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from selfcorrect.errors import FrameError
+
+__all__ = ["Frame", "Half", "Repairs"]
+
+Pair = tuple[Any, Any]
+_CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 1, "depth": 1}
+_RADIANCE = ("color", "denoised", "denoised_full")
+
+
+class Repairs(NamedTuple):
+    """How many pixels of a buffer were changed on the way in."""
+
+    non_finite: int
+    negative: int
+
+
+class Half(NamedTuple):
+    """The buffers of one half, (H, W, C) float32; None where the frame has no such buffer."""
+
+    color: Tensor
+    denoised: Tensor | None
+    albedo: Tensor | None
+    normal: Tensor | None
+    visibility: Tensor | None
+    depth: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame as two independent halves a and b, each with half of the samples.
+
+    Every buffer is a pair of (H, W, C) float arrays, NumPy or torch; (H, W) will do for one channel. They become
+    float32 tensors. Pixels that are NaN or infinite are filled from their finite neighbours, negative radiance
+    is clipped at 0 (as published), and both are counted in ``repairs``.
+
+    Args:
+        color: noisy linear radiance, 3 channels, ≥ 0.
+        denoised: the denoised halves, linear radiance, 3 channels; needed by :func:`selfcorrect.correct`.
+        albedo: 3 channels, usually 0 … 1.
+        normal: 3 channels, usually of unit length.
+        visibility: 1 channel.
+        depth: 1 channel.
+        denoised_full: the denoised mean of both halves, a single array.
+
+    Raises:
+        FrameError: sizes or channel counts do not fit.
+    """
+
+    color: Pair
+    denoised: Pair | None = None
+    albedo: Pair | None = None
+    normal: Pair | None = None
+    visibility: Pair | None = None
+    depth: Pair | None = None
+    denoised_full: Any = None
+    repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
+    _like: Any = field(init=False, repr=False, default=None)
+
+    def __post_init__(self) -> None:
+        for name in _CHANNELS:
+            pair = getattr(self, name)
+            if pair is None and name != "color":
+                continue
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                raise FrameError(f"expected {name} as a pair of arrays (half a, half b), but got {type(pair).__name__}")
+            if name == "color":
+                object.__setattr__(self, "_like", pair[0])
+            self._set(name, pair)
+        if self.denoised_full is not None:
+            self._set("denoised_full", (self.denoised_full,))
+
+    def _set(self, name: str, arrays: tuple[Any, ...]) -> None:
+        """Check, repair and store the arrays of one buffer."""
+        size = None if name == "color" else self.size
+        tensors, counts = [], Repairs(0, 0)
+        for half, array in zip("ab", arrays, strict=False):
+            what = name if name == "denoised_full" else f"{name} of half {half}"
+            tensor = _as_tensor(array, what, _CHANNELS.get(name, 3))
+            if size is not None and tensor.shape[:2] != size:
+                raise FrameError(
+                    f"expected {what} of {size[1]}x{size[0]} pixels like the colour of half a, "
+                    f"but got {tensor.shape[1]}x{tensor.shape[0]}"
+                )
+            size = (tensor.shape[0], tensor.shape[1])
+            tensor, repairs = _repair(tensor, radiance=name in _RADIANCE)
+            tensors.append(tensor)
+            counts = Repairs(*(x + y for x, y in zip(counts, repairs, strict=True)))
+        object.__setattr__(self, name, tensors[0] if name == "denoised_full" else tuple(tensors))
+        self.repairs[name] = counts
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        height, width, _ = self.color[0].shape
+        return height, width
+
+    @property
+    def halves(self) -> tuple[Half, Half]:
+        """Half a and half b."""
+
+        def one(i: int) -> Half:
+            return Half(*(None if pair is None else pair[i] for pair in (getattr(self, n) for n in Half._fields)))
+
+        return one(0), one(1)
+
+    def denoise(self, denoiser: Callable[..., Any], *, full: bool = True) -> "Frame":
+        """This frame with each half denoised on its own, with its own G-buffers.
+
+        Args:
+            denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors.
+            full: also denoise the mean of the halves.
+        """
+        inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
+        pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
+        mean = [None if a is None or b is None else (a + b) / 2 for a, b in zip(*inputs, strict=True)]
+        return self.with_denoised(pair, denoiser(mean[0], albedo=mean[1], normal=mean[2]) if full else None)
+
+    def with_denoised(self, denoised: Pair, denoised_full: Any = None) -> "Frame":
+        """This frame with these denoised images; its other buffers are not checked again."""
+        frame = object.__new__(Frame)
+        for name, value in vars(self).items():
+            object.__setattr__(frame, name, value)
+        object.__setattr__(frame, "repairs", dict(self.repairs))
+        frame._set("denoised", denoised)
+        if denoised_full is not None:
+            frame._set("denoised_full", (denoised_full,))
+        return frame
+
+    def to(self, device: str | torch.device) -> "Frame":
+        """This frame with all its tensors on ``device``."""
+        frame = self.with_denoised(self.denoised) if self.denoised is not None else self
+        for name in (*_CHANNELS, "denoised_full"):
+            value = getattr(self, name)
+            moved = tuple(t.to(device) for t in value) if isinstance(value, tuple) else value
+            object.__setattr__(frame, name, moved.to(device) if isinstance(value, Tensor) else moved)
+        return frame
+
+    def like_input(self, image: Tensor) -> Any:
+        """``image`` as the kind of array, and on the device, that the colour of half a was given in."""
+        if isinstance(self._like, Tensor):
+            return image.to(self._like.device, self._like.dtype)
+        return image.cpu().numpy().astype(np.asarray(self._like).dtype)
+
+
+def _as_tensor(array: Any, what: str, channels: int) -> Tensor:
+    tensor = array.detach() if isinstance(array, Tensor) else torch.from_numpy(np.array(array, order="C"))
+    if not tensor.is_floating_point():
+        raise FrameError(f"expected {what} as floating-point numbers, but got {tensor.dtype}")
+    if tensor.ndim == 2 and channels == 1:
+        tensor = tensor[:, :, None]
+    if tensor.ndim != 3 or tensor.shape[2] != channels or 0 in tensor.shape:
+        raise FrameError(f"expected {what} of shape (H, W, {channels}), but got {tuple(tensor.shape)}")
+    # float64 beyond the range of float32 would turn into an infinity that the render does not have
+    return tensor.clamp(torch.finfo(torch.float32).min, torch.finfo(torch.float32).max).float() if (
+        tensor.dtype == torch.float64
+    ) else tensor.float()
+
+
+def _repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:
+    finite = image.isfinite().all(-1)
+    broken = int((~finite).sum())
+    if broken:
+        image = _fill(image, finite)
+    negative = int((image < 0).any(-1).sum()) if radiance else 0
+    if negative:
+        image = image.clamp(min=0)
+    return image, Repairs(broken, negative)
+
+
+def _fill(image: Tensor, known: Tensor) -> Tensor:
+    """Fill unknown pixels from the known ones around them, nearer ones first (push-pull); all unknown gives 0."""
+    weight = known.to(image.dtype)[None, None]
+    value = torch.where(known[..., None], image, 0.0).permute(2, 0, 1)[None]
+    filled = _push_pull(value, weight)[0].permute(1, 2, 0)
+    return torch.where(known[..., None], image, filled)
+
+
+def _push_pull(value: Tensor, weight: Tensor) -> Tensor:
+    """``value`` is already zero where ``weight`` is; returns it with the gaps filled from coarser levels."""
+    if min(value.shape[-2:]) == max(value.shape[-2:]) == 1 or bool(weight.all()):
+        return value
+    coarse_weight = F.avg_pool2d(weight, 2, ceil_mode=True, count_include_pad=False)
+    coarse_value = F.avg_pool2d(value, 2, ceil_mode=True, count_include_pad=False)
+    known = coarse_weight > 0
+    coarse = torch.where(known, coarse_value / coarse_weight.clamp(min=1e-12), 0.0)
+    filled = F.interpolate(_push_pull(coarse, known.to(weight.dtype)), size=value.shape[-2:], mode="nearest")
+    return torch.where(weight > 0, value, filled)

@@ -1,0 +1,88 @@
+"""What the kernel reads: the guide buffers of one half, padded once, so that no border is left to handle."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["LARGEST", "Guides", "mirror"]
+
+LARGEST = 1e15  # keeps squared differences in the window finite in float32
+_LANES = 16  # the widest vector reads up to this many pixels beyond the last one
+
+
+def mirror(start: int, stop: int, size: int) -> Tensor:
+    """Indices ``start … stop-1`` of a line of ``size`` pixels mirrored at its ends, the edge pixel repeated.
+
+    NumPy's ``symmetric`` padding, for any distance beyond the ends.
+
+    >>> mirror(-3, 5, 2).tolist()
+    [1, 1, 0, 0, 1, 1, 0, 0]
+    """
+    index = torch.arange(start, stop) % (2 * size)
+    return torch.where(index < size, index, 2 * size - 1 - index)
+
+
+@dataclass(frozen=True)
+class Guides:
+    """The guide buffers of one half, in planes mirrored ``margin`` pixels beyond the image.
+
+    ``planes`` is (C, H + 2·margin, W + 2·margin + slack) with the channels in the order of the paper's network
+    input: y(3), albedo(3), visibility(1), normal(3), z(3). A buffer that the frame does not have has no plane.
+    """
+
+    planes: Tensor
+    height: int
+    width: int
+    margin: int
+    has_albedo: bool
+    has_normal: bool
+    has_visibility: bool
+
+    @classmethod
+    def of_half(  # noqa: PLR0913 - one argument for each buffer that a half can have
+        cls,
+        color: Tensor,
+        denoised: Tensor,
+        *,
+        margin: int,
+        albedo: Tensor | None = None,
+        normal: Tensor | None = None,
+        visibility: Tensor | None = None,
+    ) -> "Guides":
+        """Pad the (H, W, C) buffers of one half by ``margin`` ≥ window // 2 pixels; bounds them by ±1e15."""
+        height, width, _ = color.shape
+        given = [b for b in (color, albedo, visibility, normal, denoised) if b is not None]
+        stacked = torch.cat([b.permute(2, 0, 1) for b in given]).clamp(-LARGEST, LARGEST)
+        rows = mirror(-margin, height + margin, height).to(color.device)
+        columns = mirror(-margin, width + margin + _LANES, width).to(color.device)
+        planes = stacked.index_select(1, rows).index_select(2, columns).contiguous()
+        return cls(
+            planes, height, width, margin, albedo is not None, normal is not None, visibility is not None
+        )
+
+    @property
+    def betas(self) -> int:
+        """Number of Eq. 10's scales β: three for each of z, albedo and normal."""
+        return 3 * (1 + self.has_albedo + self.has_normal)
+
+    @property
+    def gammas(self) -> int:
+        """Number of Eq. 11's bandwidths γ: y, z, and one for each G-buffer."""
+        return 2 + self.has_albedo + self.has_normal + self.has_visibility
+
+    @property
+    def radiance(self) -> Tensor:
+        """The planes of y, (3, …)."""
+        return self.planes[:3]
+
+    @property
+    def denoised(self) -> Tensor:
+        """The planes of z, (3, …)."""
+        return self.planes[-3:]
+
+    def patches(self, corners: Tensor, size: tuple[int, int]) -> Tensor:
+        """Cut (N, C, h, w) patches; ``corners`` (N, 2) are the rows and columns of their first pixels."""
+        rows = (corners[:, 0, None] + self.margin + torch.arange(size[0])).to(self.planes.device)
+        columns = (corners[:, 1, None] + self.margin + torch.arange(size[1])).to(self.planes.device)
+        return self.planes[:, rows[:, :, None], columns[:, None, :]].transpose(0, 1)

@@ -1,0 +1,44 @@
+// What one call of the kernel works on. Pointers are borrowed from the caller for the length of the call.
+#pragma once
+
+#include <cstdint>
+
+namespace selfcorrect {
+
+enum class Mode { forward, backward, loss };
+
+struct Job {
+    // Padded guide planes, (channels, height, width): y 3, albedo 3, visibility 1, normal 3, z 3; absent ones left out.
+    const float* planes;
+    std::int64_t plane_stride, row_stride;
+    bool has_albedo, has_normal, has_visibility;
+    bool eq3;  // Eq. 3: beta^z = 1, no other beta; else Eq. 10
+    int window;
+
+    // Raw network outputs and their gradient, (patches, heads, h, w) with any strides.
+    const float* heads;
+    float* heads_gradient;
+    std::int64_t head_strides[4], gradient_strides[4];
+    int patches, height, width;
+    const std::int64_t* corners;  // (patches, 2): row and column of each patch's first pixel in the padded planes
+
+    float* output;                 // forward: g, (patches, 3, h, w), contiguous
+    const float* output_gradient;  // backward: dL/dg, the same shape
+
+    // loss: other half's radiance (3 planes) and its weight (1 plane), padded like `planes`; one sum per patch row.
+    const float* target;
+    const float* weight;
+    double* row_loss;
+};
+
+// Each works on patch row `row` in [0, patches * height); `scratch` holds scratch_size(window) floats.
+using RowFunction = void (*)(const Job&, Mode, std::int64_t row, float* scratch);
+
+// Weight and two logarithmic distances of every tap, at the widest vector; plus room to align.
+constexpr std::int64_t scratch_size(int window) { return 3LL * window * window * 16 + 16; }
+
+void row_avx512(const Job&, Mode, std::int64_t, float*);
+void row_avx2(const Job&, Mode, std::int64_t, float*);
+void row_baseline(const Job&, Mode, std::int64_t, float*);
+
+}  // namespace selfcorrect

@@ -1,0 +1,141 @@
+// Python's door to the kernel: checks nothing but types (kernel/__init__.py validates), releases the GIL, spreads
+// the rows over threads. Rows are independent, so the result does not depend on the number of threads.
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <atomic>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "job.h"
+#if defined(SELFCORRECT_X86)
+#include <xmmintrin.h>
+#endif
+
+namespace nb = nanobind;
+using nb::ndarray;
+using selfcorrect::Job;
+using selfcorrect::Mode;
+using selfcorrect::RowFunction;
+
+using Array = ndarray<float, nb::device::cpu>;
+using Corners = ndarray<std::int64_t, nb::device::cpu, nb::c_contig>;
+using Sums = ndarray<double, nb::device::cpu, nb::c_contig>;
+
+namespace {
+
+// Denormal weights contribute nothing and cost a hundred cycles each.
+class FlushDenormals {
+#if defined(SELFCORRECT_X86)
+    unsigned saved = _mm_getcsr();
+
+public:
+    FlushDenormals() { _mm_setcsr(saved | 0x8040); }
+    ~FlushDenormals() { _mm_setcsr(saved); }
+#endif
+};
+
+std::vector<std::string> instruction_sets() {
+    std::vector<std::string> names{"baseline"};
+#if defined(SELFCORRECT_X86)
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) names.push_back("avx2");
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw"))
+        names.push_back("avx512");
+#endif
+    return names;
+}
+
+RowFunction row_function(const std::string& name) {
+    const auto names = instruction_sets();
+    if (std::find(names.begin(), names.end(), name) == names.end())
+        throw std::invalid_argument("expected an instruction set this processor has, but got " + name);
+#if defined(SELFCORRECT_X86)
+    if (name == "avx512") return selfcorrect::row_avx512;
+    if (name == "avx2") return selfcorrect::row_avx2;
+#endif
+    return selfcorrect::row_baseline;
+}
+
+void run(const Job& job, Mode mode, const std::string& instruction_set, int threads) {
+    const RowFunction row = row_function(instruction_set);
+    const std::int64_t rows = std::int64_t(job.patches) * job.height;
+    std::atomic<std::int64_t> next{0};
+    const auto work = [&] {
+        const FlushDenormals flush;
+        std::vector<float> scratch(selfcorrect::scratch_size(job.window));
+        for (std::int64_t i = next++; i < rows; i = next++) row(job, mode, i, scratch.data());
+    };
+    nb::gil_scoped_release release;
+    const int extra = int(std::min<std::int64_t>(threads, rows)) - 1;
+    std::vector<std::thread> pool;
+    for (int i = 0; i < extra; ++i) pool.emplace_back(work);
+    work();
+    for (auto& thread : pool) thread.join();
+}
+
+Job make_job(const Array& planes, const Array& heads, const Corners& corners, int window, bool albedo, bool normal,
+             bool visibility, bool eq3) {
+    Job job{};
+    job.planes = planes.data();
+    job.plane_stride = planes.stride(0);
+    job.row_stride = planes.stride(1);
+    job.has_albedo = albedo;
+    job.has_normal = normal;
+    job.has_visibility = visibility;
+    job.eq3 = eq3;
+    job.window = window;
+    job.heads = heads.data();
+    for (int i = 0; i < 4; ++i) job.head_strides[i] = heads.stride(i);
+    job.patches = int(heads.shape(0));
+    job.height = int(heads.shape(2));
+    job.width = int(heads.shape(3));
+    job.corners = corners.data();
+    return job;
+}
+
+void set_gradient(Job& job, const Array& gradient) {
+    job.heads_gradient = gradient.data();
+    for (int i = 0; i < 4; ++i) job.gradient_strides[i] = gradient.stride(i);
+}
+
+}  // namespace
+
+NB_MODULE(_cpu, m) {
+    m.def("instruction_sets", &instruction_sets, "Names this processor can run, slowest first.");
+
+    m.def("forward",
+          [](Array planes, Array heads, Corners corners, int window, bool albedo, bool normal, bool visibility,
+             bool eq3, const std::string& instruction_set, int threads, Array output) {
+              Job job = make_job(planes, heads, corners, window, albedo, normal, visibility, eq3);
+              job.output = output.data();
+              run(job, Mode::forward, instruction_set, threads);
+          });
+
+    m.def("backward",
+          [](Array planes, Array heads, Corners corners, int window, bool albedo, bool normal, bool visibility,
+             bool eq3, const std::string& instruction_set, int threads, Array output_gradient, Array gradient) {
+              Job job = make_job(planes, heads, corners, window, albedo, normal, visibility, eq3);
+              job.output_gradient = output_gradient.data();
+              set_gradient(job, gradient);
+              run(job, Mode::backward, instruction_set, threads);
+          });
+
+    m.def("loss",
+          [](Array planes, Array heads, Corners corners, int window, bool albedo, bool normal, bool visibility,
+             bool eq3, const std::string& instruction_set, int threads, Array target, Array weight, Array gradient,
+             Sums row_loss) {
+              Job job = make_job(planes, heads, corners, window, albedo, normal, visibility, eq3);
+              job.target = target.data();
+              job.weight = weight.data();
+              job.row_loss = row_loss.data();
+              set_gradient(job, gradient);
+              run(job, Mode::loss, instruction_set, threads);
+          });
+}

@@ -1,0 +1,98 @@
+"""One settings object. The command's flags are its fields; every default names its source."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Self
+
+from selfcorrect.errors import SettingsError
+
+__all__ = ["Settings"]
+
+_PAPER = "Back et al. 2022"
+
+
+def _setting(default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0) -> Any:
+    """A field with what the command's help and the range check need."""
+    return field(default=default, metadata={"help": help_, "source": source, "choices": choices, "least": least})
+
+
+_KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
+    str: ("a name", (str,)),
+    int: ("a whole number", (int,)),
+    float: ("a number", (int, float)),
+    bool: ("true or false", (bool,)),
+}
+
+
+def _check(name: str, value: Any, kind: type, metadata: Mapping[str, Any]) -> None:
+    expected, types = _KINDS[kind]
+    if not isinstance(value, types) or (isinstance(value, bool) and kind is not bool):
+        raise SettingsError(f"expected {expected} for the setting {name}, but got {value!r}")
+    if kind is str and value not in metadata["choices"]:
+        raise SettingsError(f"expected {name} out of {', '.join(metadata['choices'])}, but got {value!r}")
+    if kind in (int, float) and not metadata["least"] <= value < float("inf"):
+        raise SettingsError(f"expected {name} of at least {metadata['least']}, but got {value!r}")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides the result, given the same input, machine and thread count.
+
+    Raises:
+        SettingsError: a value is out of range.
+    """
+
+    combination: str = _setting(
+        "eq10", "what the window's pixels are combined to", f"{_PAPER}, Table 1", choices=("eq10", "eq3")
+    )
+    window: int = _setting(19, "side of the cross-bilateral window, odd, at most 31", f"{_PAPER}, Sec. 4", least=1)
+    filters: int = _setting(16, "filters of each hidden convolution", f"{_PAPER}, Sec. 4", least=1)
+    layers: int = _setting(9, "3x3 convolutions", f"{_PAPER}, Sec. 4", least=2)
+    patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1)
+    stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
+    batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
+    epochs: int = _setting(20, "passes over all patches", f"{_PAPER}, Sec. 4", least=0)
+    learning_rate: float = _setting(
+        0.01, "Adam's rate over the root of the halves' variance", f"{_PAPER}, published code"
+    )
+    adam_epsilon: float = _setting(1e-7, "Adam's epsilon", f"{_PAPER}, published code")
+    loss_epsilon: float = _setting(0.01, "added to the squared radiance in the loss", f"{_PAPER}, Eq. 8", least=1e-12)
+    seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            _check(f.name, getattr(self, f.name), type(f.default), f.metadata)
+        if self.window % 2 == 0 or self.window > 31:
+            raise SettingsError(f"expected an odd window of at most 31, but got {self.window}")
+        if self.stride > self.patch:
+            raise SettingsError(f"expected a stride of at most the patch ({self.patch}), but got {self.stride}")
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        """Every preset by its name; the first is the default."""
+        return {"paper": cls()}
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> Self:
+        """The preset of this name, with single fields changed.
+
+        Raises:
+            SettingsError: no such preset, or no such field.
+        """
+        presets = cls.presets()
+        if name not in presets:
+            raise SettingsError(f"expected a preset out of {', '.join(presets)}, but got {name!r}")
+        return cls.from_dict(asdict(presets[name]) | changes)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Settings from saved values; unknown keys are errors."""
+        unknown = sorted(set(values) - {f.name for f in fields(cls)})
+        if unknown:
+            known = ", ".join(f.name for f in fields(cls))
+            raise SettingsError(f"expected settings out of {known}, but got {unknown[0]!r}")
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON and for the output's attributes."""
+        return asdict(self)
