@@ -106,7 +106,7 @@ def _guides(frame: Frame, corners: Tensor, settings: Settings) -> tuple[Guides, 
     return one(0), one(1)
 
 
-def _train(  # noqa: PLR0913 - a training run is made of exactly these
+def _train(
     network: Network,
     guides: tuple[Guides, Guides],
     corners: Tensor,
@@ -116,14 +116,14 @@ def _train(  # noqa: PLR0913 - a training run is made of exactly these
     progress: Progress | None,
 ) -> list[float]:
     size = (settings.patch, settings.patch)
-    weights = tuple(relative_weight(half.denoised, settings.loss_epsilon) for half in guides)
+    a, b = (relative_weight(half.denoised, settings.loss_epsilon) for half in guides)
     optimiser = torch.optim.Adam(network.parameters(), lr=rate, eps=settings.adam_epsilon)
     steps = settings.epochs * -(-len(corners) // settings.batch)
     losses: list[float] = []
     for _ in range(settings.epochs):
         for chosen in torch.randperm(len(corners), generator=generator).split(settings.batch):
             batch = torch.cat([half.patches(corners[chosen], size) for half in guides])
-            loss = dual_buffer_loss(network(batch), corners[chosen], guides, weights, settings)
+            loss = dual_buffer_loss(network(batch), corners[chosen], guides, (a, b), settings)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

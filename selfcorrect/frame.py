@@ -76,7 +76,7 @@ class Frame:
                 raise FrameError(f"expected {name} as a pair of arrays (half a, half b), but got {type(pair).__name__}")
             if name == "color":
                 object.__setattr__(self, "_like", pair[0])
-            self._set(name, pair)
+            self._set(name, tuple(pair))
         if self.denoised_full is not None:
             self._set("denoised_full", (self.denoised_full,))
 
@@ -110,7 +110,8 @@ class Frame:
         """Half a and half b."""
 
         def one(i: int) -> Half:
-            return Half(*(None if pair is None else pair[i] for pair in (getattr(self, n) for n in Half._fields)))
+            pairs = {name: getattr(self, name) for name in Half._fields}
+            return Half(**{name: None if pair is None else pair[i] for name, pair in pairs.items()})
 
         return one(0), one(1)
 
@@ -142,8 +143,10 @@ class Frame:
         frame = self.with_denoised(self.denoised) if self.denoised is not None else self
         for name in (*_CHANNELS, "denoised_full"):
             value = getattr(self, name)
-            moved = tuple(t.to(device) for t in value) if isinstance(value, tuple) else value
-            object.__setattr__(frame, name, moved.to(device) if isinstance(value, Tensor) else moved)
+            if isinstance(value, tuple):
+                object.__setattr__(frame, name, tuple(tensor.to(device) for tensor in value))
+            elif value is not None:
+                object.__setattr__(frame, name, value.to(device))
         return frame
 
     def like_input(self, image: Tensor) -> Any:
@@ -162,9 +165,11 @@ def _as_tensor(array: Any, what: str, channels: int) -> Tensor:
     if tensor.ndim != 3 or tensor.shape[2] != channels or 0 in tensor.shape:
         raise FrameError(f"expected {what} of shape (H, W, {channels}), but got {tuple(tensor.shape)}")
     # float64 beyond the range of float32 would turn into an infinity that the render does not have
-    return tensor.clamp(torch.finfo(torch.float32).min, torch.finfo(torch.float32).max).float() if (
-        tensor.dtype == torch.float64
-    ) else tensor.float()
+    return (
+        tensor.clamp(torch.finfo(torch.float32).min, torch.finfo(torch.float32).max).float()
+        if (tensor.dtype == torch.float64)
+        else tensor.float()
+    )
 
 
 def _repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:

@@ -1,5 +1,7 @@
 """The dual-buffer loss and the learning rate, which need no reference (Back et al. 2022, Eqs. 8 and 9)."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -30,11 +32,10 @@ def dual_buffer_loss(
     """
     a, b = guides
     raw_a, raw_b = raw.chunk(2)
-    options = {
-        "window": settings.window,
-        "combination": settings.combination,
-        "threads": torch.get_num_threads(),
-    }
-    return cross_bilateral_loss(a, raw_a, corners, b.radiance, weights[1], **options) + cross_bilateral_loss(
-        b, raw_b, corners, a.radiance, weights[0], **options
+    one_way = partial(
+        cross_bilateral_loss,
+        window=settings.window,
+        combination=settings.combination,
+        threads=torch.get_num_threads(),
     )
+    return one_way(a, raw_a, corners, b.radiance, weights[1]) + one_way(b, raw_b, corners, a.radiance, weights[0])

@@ -1,5 +1,7 @@
 """The network of Back et al. 2022: nine 3×3 convolutions, 20,303 parameters with all thirteen inputs."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
@@ -23,12 +25,13 @@ class Network(nn.Module):
     def __init__(self, inputs: int, heads: int, *, filters: int, layers: int, generator: torch.Generator):
         super().__init__()
         widths = [inputs, *[filters] * (layers - 1), heads]
-        self.convolutions = nn.ModuleList(
-            nn.Conv2d(i, o, 3, padding=1) for i, o in zip(widths[:-1], widths[1:], strict=True)
-        )
-        for convolution in self.convolutions:
+        self.convolutions = nn.ModuleList()
+        for i, o in pairwise(widths):
+            # skip_init: torch's own first weights would draw from the caller's random numbers
+            convolution = nn.utils.skip_init(nn.Conv2d, i, o, 3, padding=1)
             nn.init.xavier_uniform_(convolution.weight, generator=generator)
             nn.init.zeros_(convolution.bias)
+            self.convolutions.append(convolution)
 
     @classmethod
     def for_guides(cls, guides: Guides, settings: Settings, generator: torch.Generator) -> "Network":
@@ -37,7 +40,9 @@ class Network(nn.Module):
         network = cls(
             guides.planes.shape[0], heads, filters=settings.filters, layers=settings.layers, generator=generator
         )
-        return network.to(guides.planes.device, memory_format=torch.channels_last)
+        network.to(guides.planes.device)
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # lacking in torch's stubs
+        return network
 
     @property
     def shape(self) -> list[tuple[int, ...]]:

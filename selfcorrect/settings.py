@@ -24,13 +24,13 @@ _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
 }
 
 
-def _check(name: str, value: Any, kind: type, metadata: Mapping[str, Any]) -> None:
+def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) -> None:
     expected, types = _KINDS[kind]
     if not isinstance(value, types) or (isinstance(value, bool) and kind is not bool):
         raise SettingsError(f"expected {expected} for the setting {name}, but got {value!r}")
     if kind is str and value not in metadata["choices"]:
         raise SettingsError(f"expected {name} out of {', '.join(metadata['choices'])}, but got {value!r}")
-    if kind in (int, float) and not metadata["least"] <= value < float("inf"):
+    if isinstance(value, (int, float)) and not metadata["least"] <= value < float("inf"):
         raise SettingsError(f"expected {name} of at least {metadata['least']}, but got {value!r}")
 
 

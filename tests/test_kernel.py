@@ -111,7 +111,9 @@ def test_reference_by_hand() -> None:
         for column in range(5):
             i = pixel(row, column)
             d = {name: ((c[name] - i[name]) ** 2).sum() for name in c}
-            exponent = torch.stack([torch.log(1 + d["y"]), torch.log(1 + d["z"]), d["albedo"], d["normal"], d["visibility"]])
+            exponent = torch.stack(
+                [torch.log(1 + d["y"]), torch.log(1 + d["z"]), d["albedo"], d["normal"], d["visibility"]]
+            )
             w = tau if (row, column) == (1, 2) else torch.exp(-(exponent / (gamma**2 + 1e-4)).sum())
             g = i["y"] + beta[0] * (c["z"] - i["z"])
             g = g + beta[1] * (c["albedo"] - i["albedo"]) + beta[2] * (c["normal"] - i["normal"])
@@ -168,9 +170,7 @@ def test_cpu_with_saturated_heads(scale: float, isa: str) -> None:
     corners = torch.zeros(1, 2, dtype=torch.int64)
     expected = reference.cross_bilateral(guides, raw, corners, window=9)
     got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral(
-        single(guides), got_raw, corners, window=9, combination="eq10", threads=1, isa=isa
-    )
+    got = cpu.cross_bilateral(single(guides), got_raw, corners, window=9, combination="eq10", threads=1, isa=isa)
     got.sum().backward()
     assert_close("g", got, expected, 1e-4)
     assert got_raw.grad.isfinite().all()
@@ -227,9 +227,7 @@ def test_threads_do_not_change_a_bit() -> None:
     results = []
     for threads in (1, 2, 5):
         leaf = raw.clone().requires_grad_()
-        loss = cross_bilateral_loss(
-            guides, leaf, corners, guides.denoised, guides.planes[3], window=7, threads=threads
-        )
+        loss = cross_bilateral_loss(guides, leaf, corners, guides.denoised, guides.planes[3], window=7, threads=threads)
         loss.backward()
         results.append((loss.detach(), leaf.grad))
     for loss, gradient in results[1:]:

@@ -97,7 +97,6 @@ def cross_bilateral_loss(
     soon as its output is, so that the compiled kernel visits each pixel once.
     """
     _validate(guides, raw, corners, window, combination)
-    options = {"window": window, "combination": combination}
     if _backend(guides.planes, backend) == "cpu":
         return cpu.cross_bilateral_loss(
             guides, raw, corners, target, weight, window=window, combination=combination, threads=threads
@@ -107,5 +106,5 @@ def cross_bilateral_loss(
     rows = corners[:, 0, None] + guides.margin + torch.arange(size[0])
     columns = corners[:, 1, None] + guides.margin + torch.arange(size[1])
     cut = padded[:, rows[:, :, None], columns[:, None, :]].transpose(0, 1)
-    g = cross_bilateral(guides, raw, corners, backend=backend, **options)
+    g = cross_bilateral(guides, raw, corners, window=window, combination=combination, backend=backend)
     return (0.5 * cut[:, 3:] * (g - cut[:, :3]) ** 2).mean()

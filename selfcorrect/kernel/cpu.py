@@ -76,7 +76,7 @@ def cross_bilateral(
 ) -> Tensor:
     """Eq. 10, like :func:`selfcorrect.kernel.reference.cross_bilateral`, for float32 on the CPU."""
     options = (window, combination, isa or instruction_sets()[-1], threads)
-    result: Tensor = _CrossBilateral.apply(raw, guides, corners, *options)
+    result: Tensor = _CrossBilateral.apply(raw, guides, corners, *options)  # type: ignore[no-untyped-call]  # torch's
     return result
 
 
@@ -94,5 +94,7 @@ def cross_bilateral_loss(
 ) -> Tensor:
     """One half of Eq. 8, value and gradient in one visit of each pixel."""
     options = (window, combination, isa or instruction_sets()[-1], threads)
-    result: Tensor = _CrossBilateralLoss.apply(raw, guides, corners, target, weight, *options)
+    result: Tensor = _CrossBilateralLoss.apply(  # type: ignore[no-untyped-call]  # torch's
+        raw, guides, corners, target, weight, *options
+    )
     return result

@@ -40,7 +40,7 @@ class Guides:
     has_visibility: bool
 
     @classmethod
-    def of_half(  # noqa: PLR0913 - one argument for each buffer that a half can have
+    def of_half(
         cls,
         color: Tensor,
         denoised: Tensor,
@@ -57,9 +57,7 @@ class Guides:
         rows = mirror(-margin, height + margin, height).to(color.device)
         columns = mirror(-margin, width + margin + _LANES, width).to(color.device)
         planes = stacked.index_select(1, rows).index_select(2, columns).contiguous()
-        return cls(
-            planes, height, width, margin, albedo is not None, normal is not None, visibility is not None
-        )
+        return cls(planes, height, width, margin, albedo is not None, normal is not None, visibility is not None)
 
     @property
     def betas(self) -> int:

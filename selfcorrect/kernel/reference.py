@@ -87,9 +87,9 @@ def _pixels(stacked: Tensor, guides: Guides) -> _Pixels:
 def _weight(c: _Pixels, i: _Pixels, heads: Heads) -> Tensor:
     """Eq. 11: w_i, (N, 1, T, h, w)."""
 
-    def term(a: Tensor | None, b: Tensor | None, gamma: Tensor | None, logarithmic: bool = False) -> Tensor | float:
+    def term(a: Tensor | None, b: Tensor | None, gamma: Tensor | None, logarithmic: bool = False) -> Tensor:
         if a is None or b is None or gamma is None:
-            return 0.0
+            return torch.zeros((), device=c.y.device, dtype=c.y.dtype)
         distance = ((a - b) ** 2).sum(1, keepdim=True)
         if logarithmic:
             distance = torch.log1p(distance)

@@ -1,0 +1,7 @@
+"""``python -m selfcorrect``."""
+
+import sys
+
+from selfcorrect.cli import main
+
+sys.exit(main())

@@ -1,0 +1,144 @@
+"""From files to file: the halves of one frame in, the corrected frame out."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from selfcorrect import exr
+from selfcorrect.correct import Result
+from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
+from selfcorrect.frame import Frame
+from selfcorrect.settings import Settings
+
+__all__ = ["Loaded", "Sources", "load", "save"]
+
+_FEATURES = ("albedo", "normal", "visibility", "depth")
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files of one frame; each may be ``file.exr::Layer``.
+
+    Attributes:
+        a: half a; the output takes its other channels and its metadata from here.
+        b: half b.
+        denoised_a: denoised half a, where the user has it.
+        denoised_b: denoised half b.
+        denoised: denoised mean of both halves.
+        mapping: role → channel, for what no table knows.
+    """
+
+    a: str
+    b: str
+    denoised_a: str | None = None
+    denoised_b: str | None = None
+    denoised: str | None = None
+    mapping: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A frame in memory, and where it came from.
+
+    Attributes:
+        frame: its buffers; without denoised halves where the files hold none.
+        source: half a as it was read.
+        taken: role → channel names of half a.
+    """
+
+    frame: Frame
+    source: exr.Half
+    taken: dict[str, list[str]]
+
+
+def load(sources: Sources) -> Loaded:
+    """Read both halves and, where they are given, their denoised images.
+
+    Raises:
+        FileError: a file cannot be read, or the same file was given twice.
+        ChannelError: a channel is missing.
+        FrameError: sizes do not fit.
+    """
+    _check_distinct(sources)
+    half_a = exr.load_half(sources.a, mapping=sources.mapping)
+    half_b = exr.load_half(sources.b, mapping=sources.mapping)
+    height, width = half_a.buffers["color"].shape[:2]
+    if half_b.buffers["color"].shape[:2] != (height, width):
+        other = half_b.buffers["color"].shape
+        raise FrameError(
+            f"{sources.b}: expected {width}x{height} pixels like {sources.a}, but got {other[1]}x{other[0]}"
+        )
+    pairs: dict[str, Any] = {"color": (half_a.buffers["color"], half_b.buffers["color"])}
+    taken = {"color": half_a.taken["color"]}
+    for role in _FEATURES:
+        in_a, in_b = role in half_a.buffers, role in half_b.buffers
+        if in_a != in_b:
+            there, lacking = (sources.a, sources.b) if in_a else (sources.b, sources.a)
+            raise ChannelError(f"{lacking}: expected {role} channels like {there}, but got none")
+        if in_a:
+            pairs[role] = (half_a.buffers[role], half_b.buffers[role])
+            taken[role] = half_a.taken[role]
+    denoised = _denoised(sources, half_a, half_b)
+    if denoised:
+        pairs["denoised"] = denoised
+        taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
+    if sources.denoised:
+        pairs["denoised_full"] = _color_of(sources.denoised, (height, width))
+    return Loaded(Frame(**pairs), half_a, taken)
+
+
+def save(
+    path: str,
+    loaded: Loaded,
+    result: Result,
+    *,
+    settings: Settings,
+    details: Mapping[str, Any],
+    extra: Mapping[str, Any] | None = None,
+) -> int:
+    """Write the corrected colour under the names it had in half a, with all else of half a.
+
+    Returns:
+        how many values lay beyond the range of half floats and were clipped, where the file holds those.
+    """
+    attributes = {"selfcorrect/settings": json.dumps(settings.to_dict()), "selfcorrect/run": json.dumps(dict(details))}
+    names = loaded.source.taken["color"]
+    return exr.write(path, loaded.source.file, result.image, names, attributes, extra=extra)
+
+
+def _check_distinct(sources: Sources) -> None:
+    a, b = (Path(path.partition("::")[0]) for path in (sources.a, sources.b))
+    if sources.a == sources.b or (sources.a.partition("::")[2] == sources.b.partition("::")[2] and _same_file(a, b)):
+        raise FileError(
+            f"{sources.b}: expected the other half of the samples, but got the same file twice; identical halves "
+            "carry no information: render the second one with another seed"
+        )
+    if (sources.denoised_a is None) != (sources.denoised_b is None):
+        given = sources.denoised_a or sources.denoised_b
+        raise SettingsError(f"{given}: expected both denoised halves or none, but got one")
+
+
+def _same_file(a: Path, b: Path) -> bool:
+    return a.exists() and b.exists() and os.path.samefile(a, b)
+
+
+def _denoised(sources: Sources, half_a: exr.Half, half_b: exr.Half) -> tuple[Any, Any] | None:
+    """The denoised halves that the user named, else those that lie beside the halves."""
+    size = half_a.buffers["color"].shape[:2]
+    if sources.denoised_a and sources.denoised_b:
+        return _color_of(sources.denoised_a, size), _color_of(sources.denoised_b, size)
+    if "denoised" in half_a.buffers and "denoised" in half_b.buffers:
+        return half_a.buffers["denoised"], half_b.buffers["denoised"]
+    return None
+
+
+def _color_of(path: str, size: tuple[int, ...]) -> Any:
+    color = exr.load_half(path).buffers["color"]
+    if color.shape[:2] != size:
+        raise FrameError(
+            f"{path}: expected {size[1]}x{size[0]} pixels like the halves, but got {color.shape[1]}x{color.shape[0]}"
+        )
+    return color

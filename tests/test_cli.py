@@ -1,0 +1,209 @@
+"""The real command: what it writes, prints and refuses."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from selfcorrect import Settings, cli, exr
+
+FAST = ["--patch", "32", "--stride", "16", "--epochs", "1", "--window", "5", "--denoiser", "box", "--threads", "1"]
+
+
+def write_half(path: Path, seed: int, size: tuple[int, int] = (24, 30), **extra: Any) -> Path:
+    """A half as Mitsuba writes it, with alpha and an attribute to pass through."""
+    generator = np.random.default_rng(seed)
+    names = ["R", "G", "B", "A", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.T"]
+    channels = {name: generator.random(size, dtype=np.float32).astype(np.float16) for name in names} | extra
+    channels = {name: values for name, values in channels.items() if values is not None}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "owner": "a renderer"}
+    OpenEXR.File(header, channels).write(str(path))
+    return path
+
+
+@pytest.fixture
+def halves(tmp_path: Path) -> tuple[Path, Path]:
+    return write_half(tmp_path / "a.exr", 1), write_half(tmp_path / "b.exr", 2)
+
+
+def run(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """The installed command in a process of its own."""
+    command = [sys.executable, "-m", "selfcorrect", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, **options)
+
+
+def refused(*arguments: object, **options: Any) -> str:
+    """The one line that a refused run prints; exit code 2, nothing on stdout."""
+    result = run(*arguments, **options)
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    lines = [line for line in result.stderr.splitlines() if line.startswith("selfcorrect: error: ")]
+    assert len(lines) == 1, result.stderr
+    assert result.stderr.splitlines()[-1] == lines[0]
+    assert "Traceback" not in result.stderr
+    return lines[0]
+
+
+def test_frame_writes_a_corrected_image_and_passes_the_rest_through(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out.exr"
+    result = run("frame", *halves, "-o", out, *FAST, "--json", "--seed", "3")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["output"] == str(out)
+    assert (
+        report["settings"]
+        == Settings.preset(report["preset"], patch=32, stride=16, epochs=1, window=5, seed=3).to_dict()
+    )
+    assert report["channels"]["albedo"] == ["albedo.R", "albedo.G", "albedo.B"]
+    assert report["size"] == {"width": 30, "height": 24}
+    assert {"read", "denoise", "train", "infer", "write", "total"} <= set(report["seconds"])
+    assert "color: R, G, B" in result.stderr
+    before, after = exr.read(str(halves[0])), exr.read(str(out))
+    assert after.channel_names == before.channel_names
+    for name in set(before.channel_names) - {"R", "G", "B"}:
+        np.testing.assert_array_equal(after.pixels(name), before.pixels(name))
+    assert not np.array_equal(after.pixels("R"), before.pixels("R"))
+    header = after.parts[0].header
+    assert header["owner"] == "a renderer"
+    assert json.loads(header["selfcorrect/settings"]) == report["settings"]
+    assert [p.name for p in tmp_path.iterdir() if "tmp" in p.name] == []
+
+
+def test_same_seed_writes_the_same_pixels(halves: tuple[Path, Path], tmp_path: Path, capsys: Any) -> None:
+    for name in ("one", "two"):
+        assert cli.main(["frame", *map(str, halves), "-o", str(tmp_path / f"{name}.exr"), *FAST]) == 0
+    one, two = (exr.read(str(tmp_path / f"{name}.exr")) for name in ("one", "two"))
+    np.testing.assert_array_equal(one.pixels("R"), two.pixels("R"))
+
+
+def test_denoised_halves_of_the_user_are_taken(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out.exr"
+    given = [write_half(tmp_path / f"d{i}.exr", 10 + i) for i in range(2)]
+    flags = [f for f in FAST if f not in ("--denoiser", "box")]
+    result = run("frame", *halves, "-o", out, "--denoised-a", given[0], "--denoised-b", given[1], *flags, "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["denoiser"] == "given"
+
+
+def test_repairs_are_counted_in_the_log(tmp_path: Path) -> None:
+    broken = np.full((24, 30), 0.5, np.float16)
+    broken[3, 4:7] = np.nan
+    broken[9, 9] = -1
+    a, b = write_half(tmp_path / "a.exr", 1, R=broken), write_half(tmp_path / "b.exr", 2)
+    result = run("frame", a, b, "-o", tmp_path / "out.exr", *FAST)
+    assert result.returncode == 0, result.stderr
+    assert "color: 3 pixels were NaN or infinite, 1 negative; repaired" in result.stderr
+    assert np.isfinite(exr.read(str(tmp_path / "out.exr")).pixels("R")).all()
+
+
+def test_inspect(halves: tuple[Path, Path]) -> None:
+    text = run("inspect", halves[0])
+    assert text.returncode == 0, text.stderr
+    assert "nn.X" in text.stdout
+    assert "data window" in text.stdout
+    report = json.loads(run("inspect", halves[0], "--json").stdout)
+    assert report["taken"]["color"] == ["R", "G", "B"]
+
+
+def test_compare(halves: tuple[Path, Path]) -> None:
+    same = json.loads(run("compare", halves[0], halves[0], "--json").stdout)
+    assert same["relmse"] == 0
+    assert same["flip"] == 0
+    result = run("compare", *halves, halves[0], "--weight", halves[1])
+    assert result.returncode == 0, result.stderr
+    for word in ("relMSE", "PSNR", "SSIM", "FLIP", "mean radiance ratio"):
+        assert word in result.stdout
+
+
+def test_demo_corrects_the_packaged_frame(tmp_path: Path) -> None:
+    result = run("demo", "-o", tmp_path / "new", *FAST[:-4], "--denoiser", "joint-bilateral", "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert set(report["relmse"]) == {"noisy", "denoised", "corrected"}
+    assert (tmp_path / "new" / "corrected.exr").is_file()
+
+
+class TestBadInput:
+    def test_halves_of_different_size(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        other = write_half(tmp_path / "small.exr", 3, size=(24, 29))
+        line = refused("frame", halves[0], other, "-o", tmp_path / "out.exr", *FAST)
+        assert "small.exr: expected 30x24 pixels" in line
+
+    def test_missing_colour(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        other = write_half(tmp_path / "no-red.exr", 3, R=None)
+        assert "no-red.exr" in refused("frame", halves[0], other, "-o", tmp_path / "out.exr", *FAST)
+
+    def test_missing_albedo_in_one_half(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        lacking = dict.fromkeys(["albedo.R", "albedo.G", "albedo.B"])
+        other = write_half(tmp_path / "plain.exr", 3, **lacking)
+        line = refused("frame", halves[0], other, "-o", tmp_path / "out.exr", *FAST)
+        assert "plain.exr: expected albedo channels" in line
+
+    def test_no_exr(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        (tmp_path / "text.exr").write_text("no picture")
+        assert "text.exr" in refused("frame", halves[0], tmp_path / "text.exr", "-o", tmp_path / "out.exr")
+
+    def test_missing_file(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        assert "none.exr" in refused("frame", halves[0], tmp_path / "none.exr", "-o", tmp_path / "out.exr")
+
+    def test_truncated(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        (tmp_path / "cut.exr").write_bytes(halves[1].read_bytes()[:-200])
+        assert "cut.exr" in refused("frame", halves[0], tmp_path / "cut.exr", "-o", tmp_path / "out.exr")
+
+    def test_giant_data_window(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        data = bytearray(halves[1].read_bytes())
+        at = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+        data[at : at + 16] = np.array([0, 0, 2**30, 2**30], "<i4").tobytes()
+        (tmp_path / "giant.exr").write_bytes(data)
+        assert "giant.exr" in refused("frame", halves[0], tmp_path / "giant.exr", "-o", tmp_path / "out.exr")
+
+    def test_the_same_file_twice(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        line = refused("frame", halves[0], halves[0], "-o", tmp_path / "out.exr", *FAST)
+        assert "same file twice" in line
+        os.link(halves[0], tmp_path / "link.exr")
+        assert "link.exr" in refused("frame", halves[0], tmp_path / "link.exr", "-o", tmp_path / "out.exr", *FAST)
+
+    def test_unwritable_output(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        for out in (tmp_path / "none" / "out.exr", tmp_path, tmp_path / "out.png", halves[0] / "out.exr"):
+            assert str(out) in refused("frame", *halves, "-o", out, *FAST)
+
+    @pytest.mark.parametrize(
+        ("flags", "word"),
+        [
+            (["--preset", "nonsense"], "nonsense"),
+            (["--nonsense", "1"], "--nonsense"),
+            (["--window", "4"], "window"),
+            (["--window", "x"], "--window"),
+            (["--denoiser", "nonsense"], "nonsense"),
+            (["--denoiser", "onnx:none.onnx"], "none.onnx"),
+            (["--denoiser", "none.py:Class"], "none.py"),
+            (["--device", "nonsense"], "nonsense"),
+            (["--device", "cuda"], "cuda"),
+            (["--threads", "0"], "--threads"),
+            (["--map", "albedo"], "ROLE=CHANNEL"),
+            (["--map", "albedo=Nonsense"], "Nonsense"),
+            (["--map", "nonsense=R"], "nonsense"),
+            (["--denoised-a", "none.exr"], "both denoised halves"),
+        ],
+    )
+    def test_flags(self, halves: tuple[Path, Path], tmp_path: Path, flags: list[str], word: str) -> None:
+        assert word in refused("frame", *halves, "-o", tmp_path / "out.exr", *FAST, *flags)
+
+    def test_no_command(self) -> None:
+        assert "COMMAND" in refused()
+
+    def test_an_existing_output_survives(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        out = tmp_path / "out.exr"
+        out.write_bytes(b"precious")
+        refused("frame", halves[0], tmp_path / "none.exr", "-o", out, *FAST)
+        failing = f"command:{sys.executable} -c raise(SystemExit(3)) {{color}} {{output}}"
+        line = refused("frame", *halves, "-o", out, *FAST, "--denoiser", failing)
+        assert "3" in line
+        assert out.read_bytes() == b"precious"
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "b.exr", "out.exr"]
