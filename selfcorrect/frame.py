@@ -110,7 +110,7 @@ class Frame:
         """Half a and half b."""
 
         def one(i: int) -> Half:
-            pairs = {name: getattr(self, name) for name in Half._fields}
+            pairs: dict[str, Any] = {name: getattr(self, name) for name in Half._fields}
             return Half(**{name: None if pair is None else pair[i] for name, pair in pairs.items()})
 
         return one(0), one(1)

@@ -1,0 +1,78 @@
+"""Denoisers behind one protocol: linear HDR colour in, denoised colour out.
+
+>>> import denoisers
+>>> denoise = denoisers.create("oidn")
+>>> z = denoise(color, albedo=albedo, normal=normal)  # (H, W, 3), NumPy or torch, as the colour is
+
+A plug-in (:class:`Plugin`) is an object with one method on float32 tensors; the host (:class:`Denoise`)
+converts, checks, pads and crops. One plug-in is one file here; a user's own is ``file.py:Class``.
+"""
+
+import importlib
+import importlib.util
+from types import ModuleType
+
+from denoisers.host import Denoise, Plugin
+from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
+
+__all__ = ["Denoise", "Plugin", "create", "default", "names"]
+
+
+def names() -> tuple[str, ...]:
+    """Return every form of a denoiser's specification that :func:`create` takes."""
+    return ("oidn", "joint-bilateral", "box", "onnx:MODEL.onnx", "command:PROGRAM AND ARGS", "file.py:Class")
+
+
+def default() -> str:
+    """Return the denoiser that is used when none is named: oidn where installed, else joint-bilateral."""
+    return "joint-bilateral" if importlib.util.find_spec("mitsuba_oidn") is None else "oidn"
+
+
+def create(spec: str, *, threads: int | None = None) -> Denoise:
+    """Create a denoiser from its specification.
+
+    Args:
+        spec: one of the forms that :func:`names` returns.
+        threads: CPU threads of ``oidn``, ``onnx`` and ``joint-bilateral``, at least 1; None leaves the
+            number to them. A command and a user's class see to their own threads.
+
+    Raises:
+        DenoiserError: the specification is unknown, or the model, the command or the class does not fit.
+        FileError: the model or the Python file is missing.
+        MissingPackageError: the denoiser needs an optional package; the message says what to run.
+        SettingsError: ``threads`` is less than 1.
+    """
+    if threads is not None and threads < 1:
+        raise SettingsError(f"threads: expected at least 1, but got {threads}")
+    return Denoise(_plugin(spec, threads))
+
+
+def _plugin(spec: str, threads: int | None) -> Plugin:
+    plugin: Plugin
+    match spec.split(":", maxsplit=1):
+        case ["oidn"]:
+            plugin = _adapter("oidn", extra="oidn").Oidn(threads)
+        case ["joint-bilateral"]:
+            plugin = _adapter("joint_bilateral").JointBilateral(threads)
+        case ["box"]:
+            plugin = _adapter("box").Box()
+        case ["onnx", path] if path:
+            plugin = _adapter("onnx", extra="onnx").Onnx(path, threads)
+        case ["command", line] if line:
+            plugin = _adapter("command").Command(line)
+        case _:
+            path, _, name = spec.rpartition(":")
+            if not (path.endswith(".py") and name):
+                raise DenoiserError(f"expected a denoiser of {', '.join(names())}, but got {spec!r}")
+            plugin = _adapter("user").load(path, name)
+    return plugin
+
+
+def _adapter(module: str, *, extra: str | None = None) -> ModuleType:
+    """Import an adapter only when it is asked for: its packages may be missing, and are slow to load."""
+    try:
+        return importlib.import_module(f"denoisers.{module}")
+    except ImportError as error:
+        if extra is None:
+            raise
+        raise MissingPackageError(f"the denoiser {module}", extra) from error

@@ -1,0 +1,140 @@
+"""The host of a plug-in: it converts, checks, pads and crops, so that no plug-in has to."""
+
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from denoisers.mirror import mirrored
+from selfcorrect.errors import DenoiserError, FrameError
+
+__all__ = ["Denoise", "Plugin"]
+
+FEATURES = frozenset({"albedo", "normal"})
+
+Array = NDArray[Any] | torch.Tensor
+Image = TypeVar("Image", NDArray[Any], torch.Tensor)
+
+
+class Plugin(Protocol):
+    """What a denoiser has to be; what it needs is data on it, not code in the host.
+
+    Attributes:
+        name: what messages call it.
+        multiple: height and width are padded to a multiple of this number of pixels.
+        features: those of ``"albedo"`` and ``"normal"`` that it uses; it gets no others.
+    """
+
+    name: str
+    multiple: int = 1
+    features: frozenset[str]
+
+    def denoise(self, color: torch.Tensor, albedo: torch.Tensor | None, normal: torch.Tensor | None) -> torch.Tensor:
+        """Return the denoised colour, linear and unclamped.
+
+        Each argument is a contiguous float32 CPU tensor of shape (H, W, 3) that the plug-in may overwrite,
+        finite throughout: colour is linear radiance, albedo and normal are as the renderer wrote them, or
+        None where the frame has none. The result has the shape of colour and is finite.
+        """
+        ...
+
+
+class Denoise:
+    """A denoiser to call: ``denoise(color, albedo=None, normal=None)``."""
+
+    def __init__(self, plugin: Plugin):
+        self.plugin = plugin
+        self.name = plugin.name
+        self.multiple = getattr(plugin, "multiple", 1)
+        self.features = plugin.features
+
+    def __call__(self, color: Image, albedo: Array | None = None, normal: Array | None = None) -> Image:
+        """Denoise one image.
+
+        Args:
+            color: (H, W, 3) linear HDR radiance, NumPy or torch, of any float dtype.
+            albedo: (H, W, 3) albedo in [0, 1], of either kind, or None.
+            normal: (H, W, 3) normal in [-1, 1], of either kind, or None.
+
+        Returns:
+            (H, W, 3) linear radiance, unclamped, of the kind, dtype and device of ``color``. A value that
+            the dtype cannot hold (float16 ends at 65504) becomes the largest that it can.
+
+        Raises:
+            FrameError: an array is no (H, W, 3) float array, of another size than ``color``, or not finite.
+            DenoiserError: the denoiser failed, or returned another shape or values that are not finite.
+        """
+        size = _checked_size("color", color, None)
+        for name, feature in (("albedo", albedo), ("normal", normal)):
+            if feature is not None:
+                _checked_size(name, feature, size)
+        pad = {"bottom": -size[0] % self.multiple, "right": -size[1] % self.multiple}
+        padded: torch.Tensor = mirrored(_float32("color", color), **pad)
+        with torch.no_grad():
+            result = self.plugin.denoise(
+                padded, self._feature("albedo", albedo, pad), self._feature("normal", normal, pad)
+            )
+        self._check_result(result, tuple(padded.shape))
+        return _like(color, result[: size[0], : size[1]])
+
+    def __repr__(self) -> str:
+        return f"<denoiser {self.name}>"
+
+    def _feature(self, name: str, value: Array | None, pad: dict[str, int]) -> torch.Tensor | None:
+        if value is None or name not in self.features:
+            return None
+        return mirrored(_float32(name, value), **pad)
+
+    def _check_result(self, result: object, shape: tuple[int, ...]) -> None:
+        """Refuse by name what a plug-in must not return."""
+        expected = f"denoiser {self.name}: expected a finite float tensor of shape {shape}, but got"
+        if not isinstance(result, torch.Tensor) or not result.is_floating_point():
+            got = result.dtype if isinstance(result, torch.Tensor) else type(result).__name__
+            raise DenoiserError(f"{expected} {got}")
+        if result.shape != shape:
+            raise DenoiserError(f"{expected} {tuple(result.shape)}")
+        bad = int((~torch.isfinite(result)).sum())
+        if bad:
+            raise DenoiserError(f"{expected} {bad} of {result.numel()} values that are NaN or infinite")
+
+
+def _checked_size(name: str, value: object, expected: tuple[int, int] | None) -> tuple[int, int]:
+    """Return (H, W) of an image that is a float array of three channels and of the expected size."""
+    size = "H, W" if expected is None else f"{expected[0]}, {expected[1]}"
+    wanted = f"{name}: expected a NumPy or torch float array of shape ({size}, 3), but got"
+    if isinstance(value, torch.Tensor):
+        floating = value.is_floating_point()
+    elif isinstance(value, np.ndarray):
+        floating = np.issubdtype(value.dtype, np.floating)
+    else:
+        raise FrameError(f"{wanted} {type(value).__name__}")
+    if not floating:
+        raise FrameError(f"{wanted} {value.dtype}")
+    shape = tuple(value.shape)
+    if len(shape) != 3 or shape[2] != 3 or 0 in shape or (expected and shape[:2] != expected):
+        raise FrameError(f"{wanted} {shape}")
+    return shape[0], shape[1]
+
+
+def _float32(name: str, value: Array) -> torch.Tensor:
+    """Copy an image to a contiguous float32 CPU tensor: the plug-in never sees the caller's memory."""
+    if isinstance(value, torch.Tensor):
+        tensor = value.detach().to("cpu", torch.float32, copy=True, memory_format=torch.contiguous_format)
+    else:
+        with np.errstate(over="ignore"):  # what float32 cannot hold is reported below
+            tensor = torch.from_numpy(np.array(value, dtype=np.float32, order="C"))
+    bad = int((~torch.isfinite(tensor)).sum())
+    if bad:
+        raise FrameError(f"{name}: expected finite values, but got {bad} that are not in float32; repair them first")
+    return tensor
+
+
+def _like(color: Image, result: torch.Tensor) -> Image:
+    """Copy a result to the kind, dtype and device of the colour it was made from."""
+    numbers = torch.finfo(color.dtype) if isinstance(color, torch.Tensor) else np.finfo(color.dtype)
+    limit = min(float(numbers.max), torch.finfo(torch.float32).max)
+    held = result.detach().to("cpu", torch.float32).clamp(-limit, limit).contiguous()
+    if isinstance(color, torch.Tensor):
+        return held.to(color.device, color.dtype)
+    return held.numpy().astype(color.dtype, copy=False)
