@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 import time
@@ -18,7 +19,7 @@ from tqdm import tqdm
 import denoisers
 from selfcorrect import exr, files, metrics
 from selfcorrect.correct import Result, correct
-from selfcorrect.errors import SelfcorrectError, SettingsError
+from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.settings import Settings
 
@@ -240,9 +241,13 @@ def _compare(options: argparse.Namespace) -> None:
     reference_b, weight = (
         None if path is None else exr.load_half(path).buffers["color"] for path in (options.reference_b, options.weight)
     )
-    result = metrics.compare(image, reference, reference_b, weight, seed=options.seed)
+    try:
+        result = metrics.compare(image, reference, reference_b, weight, seed=options.seed)
+    except FrameError as error:
+        raise FrameError(f"{options.image}: {error}") from None
     if options.json:
-        print(json.dumps(vars(result)))
+        # JSON has no infinity (the PSNR of equal images) and no NaN (the standard error of one tile)
+        print(json.dumps({name: value if math.isfinite(value) else None for name, value in vars(result).items()}))
         return
     print(f"relMSE               {result.relmse:.6g} ± {result.relmse_standard_error:.2g}")
     print(f"PSNR (tone-mapped)   {result.psnr:.2f} dB")

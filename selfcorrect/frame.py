@@ -110,8 +110,9 @@ class Frame:
         """Half a and half b."""
 
         def one(i: int) -> Half:
-            pairs: dict[str, Any] = {name: getattr(self, name) for name in Half._fields}
-            return Half(**{name: None if pair is None else pair[i] for name, pair in pairs.items()})
+            pairs = {name: getattr(self, name) for name in Half._fields}
+            own: dict[str, Any] = {name: None if pair is None else pair[i] for name, pair in pairs.items()}
+            return Half(**own)
 
         return one(0), one(1)
 

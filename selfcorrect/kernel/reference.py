@@ -145,13 +145,17 @@ def cross_bilateral(
     Returns:
         The corrected radiance, (N, 3, h, w), in the units of y.
     """
-    size = (raw.shape[2], raw.shape[3])
+    height, width, radius = raw.shape[2], raw.shape[3], window // 2
     heads = activate(raw, guides, combination)
-    c = _pixels(guides.patches(corners, size)[:, :, None], guides)
+    around = guides.patches(corners - radius, (height + 2 * radius, width + 2 * radius))
+
+    def shifted(dy: int, dx: int) -> Tensor:
+        return around[:, :, radius + dy : radius + dy + height, radius + dx : radius + dx + width]
+
+    c = _pixels(shifted(0, 0)[:, :, None], guides)
 
     def sums(taps: list[tuple[int, int]], heads: Heads) -> tuple[Tensor, Tensor]:
-        shifted = [guides.patches(corners + torch.tensor(tap), size) for tap in taps]
-        i = _pixels(torch.stack(shifted, 2), guides)
+        i = _pixels(torch.stack([shifted(*tap) for tap in taps], 2), guides)
         w = _weight(c, i, heads)
         return w.sum(2), (w * _combined(c, i, heads)).sum(2)
 
