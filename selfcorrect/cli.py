@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +21,7 @@ from selfcorrect import exr, files, metrics
 from selfcorrect.correct import Result, correct
 from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
+from selfcorrect.independence import doubts
 from selfcorrect.settings import Settings
 
 __all__ = ["main"]
@@ -89,18 +90,22 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--denoiser", metavar="NAME", help=f"one of {' | '.join(denoisers.names())}")
-    parser.add_argument("--preset", default=next(iter(Settings.presets())), help=" | ".join(Settings.presets()))
+    parser.add_argument("--preset", default=Settings.default(), help=" | ".join(Settings.presets()))
     parser.add_argument("--device", default="cpu", help="torch device: cpu, cuda, …")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads, by default all")
     parser.add_argument("--map", action="append", default=[], metavar="ROLE=CHANNEL", help="albedo=MyAlbedo, …")
+    parser.add_argument(
+        "--aov", type=_aov_names, default=[], metavar="error,blend", help="also write what the guard found, as channels"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     group = parser.add_argument_group("settings, by default those of the preset")
     for f in fields(Settings):
+        how: dict[str, Any] = {"type": type(f.default), "metavar": "|".join(f.metadata["choices"]) or "N"}
+        if isinstance(f.default, bool):
+            how = {"action": argparse.BooleanOptionalAction}
+        presets = ", ".join(f"{name}: {getattr(s, f.name)}" for name, s in Settings.presets().items())
         group.add_argument(
-            f"--{f.name.replace('_', '-')}",
-            type=type(f.default),
-            metavar="|".join(f.metadata["choices"]) or "N",
-            help=f"{f.metadata['help']} (paper: {f.default}; {f.metadata['source']})",
+            f"--{f.name.replace('_', '-')}", default=None, help=f"{f.metadata['help']} ({presets})", **how
         )
 
 
@@ -153,6 +158,8 @@ def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tu
     seconds = {"read": time.perf_counter() - start}
     for role, names in loaded.taken.items():
         _log(f"{role}: {', '.join(names)}")
+    for doubt in doubts(loaded.frame):
+        _log(f"warning: {doubt}")
     frame, denoiser = _denoised(options, loaded.frame, denoise, seconds)
     for name, repairs in frame.repairs.items():
         if any(repairs):
@@ -160,8 +167,11 @@ def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tu
     with _Progress() as progress:
         result = correct(frame.to(options.device), settings, progress=progress)
     written = time.perf_counter()
-    details = {"preset": options.preset, "denoiser": denoiser, "version": _version()}
-    clipped = files.save(output, loaded, result, settings=settings, details=details)
+    estimate = None if result.estimate is None else asdict(result.estimate)
+    details = {"preset": options.preset, "denoiser": denoiser, "version": version("selfcorrect"), "estimate": estimate}
+    clipped = files.save(output, loaded, result, settings=settings, details=details, extra=_extra(options, result))
+    if result.estimate is not None:
+        _log(str(result.estimate))
     if clipped:
         _log(f"{output}: {clipped} values beyond the range of half floats were clipped")
     seconds |= result.seconds | {"write": time.perf_counter() - written, "total": time.perf_counter() - start}
@@ -172,7 +182,7 @@ def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tu
         **details,
         "channels": loaded.taken,
         "repairs": {name: repairs._asdict() for name, repairs in frame.repairs.items()},
-        "learning_rate": result.learning_rate,
+        "input_scale": result.input_scale,
         "steps": len(result.losses),
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "size": {"width": frame.size[1], "height": frame.size[0]},
@@ -201,8 +211,20 @@ def _spent(result: Result) -> str:
     return ", ".join(f"{name} {value:.1f} s" for name, value in result.seconds.items())
 
 
-def _version() -> str:
-    return version("selfcorrect")
+def _extra(options: argparse.Namespace, result: Result) -> dict[str, Any]:
+    """The maps that --aov asks for, as channels."""
+    return {
+        f"selfcorrect.{name}": image.cpu().numpy()
+        for name, image in result.aovs.items()
+        if name.partition(".")[0] in options.aov
+    }
+
+
+def _aov_names(text: str) -> list[str]:
+    names = text.split(",")
+    if not set(names) <= {"error", "blend"}:
+        raise SettingsError(f"expected --aov error, blend or both, but got {text!r}")
+    return names
 
 
 class _Progress:

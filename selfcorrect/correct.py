@@ -1,7 +1,6 @@
-"""Optimise on one frame, infer, average. No files, no printing, no reference image."""
+"""Optimise on one frame, infer, guard. No files, no printing, no reference image."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,16 +8,15 @@ import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError
-from selfcorrect.frame import Frame
-from selfcorrect.kernel import Guides, cross_bilateral
-from selfcorrect.loss import dual_buffer_loss, learning_rate, relative_weight
+from selfcorrect.frame import Frame, Half
+from selfcorrect.guard import Estimate, Guarded, guard, keep_light
+from selfcorrect.kernel import LARGEST, Guides, cross_bilateral
 from selfcorrect.network import Network
-from selfcorrect.patches import grid
+from selfcorrect.patches import overhang
 from selfcorrect.settings import Settings
+from selfcorrect.train import Progress, train
 
 __all__ = ["Result", "correct"]
-
-Progress = Callable[[int, int, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,16 +26,21 @@ class Result:
     Attributes:
         image: corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as the frame's colour was.
         network: the trained network, for the next call's ``warm_start``.
-        learning_rate: the rate that the halves' variance gave.
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
+        estimate: what the guard says was gained; None where the settings turn it off.
+        aovs: the guard's maps, each (H, W): ``blend`` (weight of the corrected image), and ``error.before`` and
+            ``error.after`` (estimated relative squared error); empty where the guard is off.
+        input_scale: what radiance was multiplied by.
     """
 
     image: Any
     network: Network
-    learning_rate: float
     losses: list[float]
     seconds: dict[str, float]
+    estimate: Estimate | None
+    aovs: dict[str, Tensor]
+    input_scale: float
 
 
 def correct(
@@ -62,13 +65,13 @@ def correct(
     Raises:
         FrameError: the frame has no denoised halves, or ``warm_start`` was trained with other buffers or settings.
     """
-    settings = settings or next(iter(Settings.presets().values()))
-    if frame.denoised is None:
-        raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
+    settings = settings or Settings.preset(Settings.default())
     start = time.perf_counter()
+    scale = settings.input_scale or _automatic_scale(frame)
+    halves = _scaled(frame, scale)
+    margin = overhang(frame.size, settings) + settings.window // 2
+    guides = (_guides(halves[0], margin), _guides(halves[1], margin))
     generator = torch.Generator().manual_seed(settings.seed)
-    corners = grid(*frame.size, patch=settings.patch, stride=settings.stride)
-    guides = _guides(frame, corners, settings)
     network = Network.for_guides(guides[0], settings, generator)
     if warm_start is not None:
         if warm_start.shape != network.shape:
@@ -77,69 +80,91 @@ def correct(
                 f"but got {warm_start.shape[0]} … {warm_start.shape[-2]}: other buffers or settings"
             )
         network.load_state_dict(warm_start.state_dict())
-    rate = learning_rate(*frame.color, settings.learning_rate)
-    losses = _train(network, guides, corners, rate, settings, generator, progress)
+    losses = train(network, guides, settings, generator, progress)
     trained = time.perf_counter()
-    g_a, g_b = (_infer(network, half, settings) for half in guides)
-    image = ((g_a + g_b) / 2).clamp(min=0)
+    image, guarded = _finish(frame, halves, network, settings, scale)
+    estimate, aovs = (guarded.estimate, _aovs(guarded)) if guarded else (None, {})
     seconds = {"train": trained - start, "infer": time.perf_counter() - trained}
-    return Result(frame.like_input(image), network, rate, losses, seconds)
+    return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale)
 
 
-def _guides(frame: Frame, corners: Tensor, settings: Settings) -> tuple[Guides, Guides]:
-    """Both halves, padded far enough for every patch and its window."""
-    beyond = (corners + settings.patch - torch.tensor(frame.size)).max()
-    margin = max(0, int(beyond), int(-corners.min())) + settings.window // 2
-
-    def one(index: int) -> Guides:
-        half = frame.halves[index]
-        assert half.denoised is not None  # correct() has checked; tells the type checker
-        return Guides.of_half(
-            half.color,
-            half.denoised,
-            margin=margin,
-            albedo=half.albedo,
-            normal=half.normal,
-            visibility=half.visibility,
-        )
-
-    return one(0), one(1)
+def _automatic_scale(frame: Frame) -> float:
+    """What brings the denoised frame's mean near 1; by the mean of roots, which a few bright pixels do not move."""
+    assert frame.denoised is not None
+    roots = torch.stack(frame.denoised).double().mean(-1).clamp(min=0).sqrt().mean()
+    return float(1 / roots**2) if roots > 0 else 1.0
 
 
-def _train(
-    network: Network,
-    guides: tuple[Guides, Guides],
-    corners: Tensor,
-    rate: float,
-    settings: Settings,
-    generator: torch.Generator,
-    progress: Progress | None,
-) -> list[float]:
-    size = (settings.patch, settings.patch)
-    a, b = (relative_weight(half.denoised, settings.loss_epsilon) for half in guides)
-    optimiser = torch.optim.Adam(network.parameters(), lr=rate, eps=settings.adam_epsilon)
-    steps = settings.epochs * -(-len(corners) // settings.batch)
-    losses: list[float] = []
-    for _ in range(settings.epochs):
-        for chosen in torch.randperm(len(corners), generator=generator).split(settings.batch):
-            batch = torch.cat([half.patches(corners[chosen], size) for half in guides])
-            loss = dual_buffer_loss(network(batch), corners[chosen], guides, (a, b), settings)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            losses.append(float(loss.detach()))
-            if progress is not None:
-                progress(len(losses), steps, losses[-1])
-    return losses
+def _scaled(frame: Frame, scale: float) -> tuple[Half, Half]:
+    """Both halves with their radiance scaled, and bounded so that its squares stay finite."""
+    if frame.denoised is None:
+        raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
+
+    def one(half: Half) -> Half:
+        assert half.denoised is not None
+        return half._replace(color=_bounded(half.color, scale), denoised=_bounded(half.denoised, scale))
+
+    return one(frame.halves[0]), one(frame.halves[1])
+
+
+def _bounded(radiance: Tensor, scale: float) -> Tensor:
+    return (radiance.double() * scale).clamp(max=LARGEST).float()
+
+
+def _guides(half: Half, margin: int, denoised: Tensor | None = None) -> Guides:
+    """Buffers of a half, padded; with another denoised image where one is given."""
+    shown = half.denoised if denoised is None else denoised
+    assert shown is not None
+    return Guides.of_half(
+        half.color,
+        shown,
+        margin=margin,
+        albedo=half.albedo,
+        normal=half.normal,
+        visibility=half.visibility,
+    )
+
+
+def _aovs(guarded: Guarded) -> dict[str, Tensor]:
+    return {"blend": guarded.alpha, "error.before": guarded.errors[0], "error.after": guarded.errors[1]}
+
+
+def _finish(
+    frame: Frame, halves: tuple[Half, Half], network: Network, settings: Settings, scale: float
+) -> tuple[Tensor, Guarded | None]:
+    """The result from the trained network, in the frame's own units."""
+    assert halves[0].denoised is not None
+    assert halves[1].denoised is not None
+    denoised = (halves[0].denoised, halves[1].denoised)
+    given = frame.denoised_full
+    full = (denoised[0] + denoised[1]) / 2 if given is None else _bounded(given, scale)
+
+    def infer(shown: Tensor | None) -> tuple[Tensor, Tensor]:
+        return _infer(network, halves[0], shown, settings), _infer(network, halves[1], shown, settings)
+
+    with_halves = infer(None) if settings.guard or settings.inference == "halves" else None
+    with_full = infer(full) if settings.inference == "full" else with_halves
+    assert with_full is not None
+    image = ((with_full[0] + with_full[1]) / 2).clamp(min=0)
+    if not settings.guard:
+        return image / scale, None
+    assert with_halves is not None
+    color = (halves[0].color, halves[1].color)
+    guarded = guard(color, denoised, with_halves, full, image, scale=scale)
+    if not guarded.estimate.improved:
+        untouched = (frame.denoised[0] + frame.denoised[1]) / 2 if given is None and frame.denoised else given
+        return untouched, guarded
+    return keep_light(guarded.image, color) / scale, guarded
 
 
 @torch.no_grad()
-def _infer(network: Network, half: Guides, settings: Settings) -> Tensor:
+def _infer(network: Network, half: Half, shown: Tensor | None, settings: Settings) -> Tensor:
     """The corrected half, (H, W, 3), on the whole image at once."""
+    guides = _guides(half, settings.window // 2, shown)
     origin = torch.zeros(1, 2, dtype=torch.int64)
-    raw = network(half.patches(origin, (half.height, half.width)))
+    raw = network(guides.patches(origin, (guides.height, guides.width)))
     g = cross_bilateral(
-        half,
+        guides,
         raw,
         origin,
         window=settings.window,

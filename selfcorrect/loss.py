@@ -16,10 +16,13 @@ def relative_weight(denoised: Tensor, epsilon: float) -> Tensor:
     return 1.0 / (denoised.mean(0) ** 2 + epsilon)
 
 
-def learning_rate(color_a: Tensor, color_b: Tensor, factor: float) -> float:
-    """``factor`` times the root of the mean variance of the frame, (y^a − y^b)² / 4, over pixels and channels."""
-    variance = ((color_a.double() - color_b.double()) ** 2 / 4).mean()
-    return factor * float(torch.sqrt(variance))
+def learning_rate(guides: tuple[Guides, Guides], settings: Settings) -> float:
+    """The set rate; by default times the root of the frame's mean variance, (y^a − y^b)² / 4."""
+    if not settings.rate_from_variance:
+        return settings.learning_rate
+    color_a, color_b = (half.inner[:3].double() for half in guides)
+    variance = ((color_a - color_b) ** 2 / 4).mean()
+    return settings.learning_rate * float(torch.sqrt(variance))
 
 
 def dual_buffer_loss(

@@ -1,5 +1,6 @@
 """The network of Back et al. 2022: nine 3×3 convolutions, 20,303 parameters with all thirteen inputs."""
 
+import math
 from itertools import pairwise
 
 import torch
@@ -10,21 +11,28 @@ from selfcorrect.settings import Settings
 
 __all__ = ["Network"]
 
+# What the residual initialisation's heads start at: g is close to z_c plus the mean of y_i − z_i over pixels like c,
+# with wide bandwidths in the noisy radiance and narrow ones in the buffers that have little noise.
+_START_BETA_Z = 0.9
+_START_GAMMA = {"y": 3.0, "z": 1.0, "albedo": 0.2, "normal": 0.4, "visibility": 0.2}
+_START_TAU = 0.05
+_START_SPREAD = 0.1  # of the last layer's weights: heads start near the same value everywhere
+
 
 class Network(nn.Module):
     """Convolutions 3×3 with ReLU between them, zero padding, Glorot-uniform weights and zero biases.
 
     Args:
-        inputs: channels of the guides.
+        inputs: channels of the guides, radiance first and denoised radiance last.
         heads: raw outputs per pixel, see :func:`selfcorrect.kernel.heads_count`.
-        filters: filters of each hidden layer.
-        layers: number of convolutions.
+        settings: ``filters``, ``layers``, ``log_radiance``.
         generator: source of the first weights.
     """
 
-    def __init__(self, inputs: int, heads: int, *, filters: int, layers: int, generator: torch.Generator):
+    def __init__(self, inputs: int, heads: int, settings: Settings, generator: torch.Generator):
         super().__init__()
-        widths = [inputs, *[filters] * (layers - 1), heads]
+        widths = [inputs, *[settings.filters] * (settings.layers - 1), heads]
+        self.log_radiance = settings.log_radiance
         self.convolutions = nn.ModuleList()
         for i, o in pairwise(widths):
             # skip_init: torch's own first weights would draw from the caller's random numbers
@@ -37,12 +45,23 @@ class Network(nn.Module):
     def for_guides(cls, guides: Guides, settings: Settings, generator: torch.Generator) -> "Network":
         """The network that these guides and settings ask for."""
         heads = heads_count(guides, settings.combination)
-        network = cls(
-            guides.planes.shape[0], heads, filters=settings.filters, layers=settings.layers, generator=generator
-        )
+        network = cls(guides.planes.shape[0], heads, settings, generator)
+        if settings.initialisation == "residual":
+            network._start_at_residual(guides, settings.combination)
         network.to(guides.planes.device)
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # lacking in torch's stubs
         return network
+
+    def _start_at_residual(self, guides: Guides, combination: str) -> None:
+        betas = [math.atanh(_START_BETA_Z)] * 3 + [0.0] * (guides.betas - 3) if combination == "eq10" else []
+        present = {"albedo": guides.has_albedo, "normal": guides.has_normal, "visibility": guides.has_visibility}
+        gammas = [value for name, value in _START_GAMMA.items() if present.get(name, True)]
+        last = self.convolutions[-1]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
+        with torch.no_grad():
+            last.weight.mul_(_START_SPREAD)
+            last.bias.copy_(torch.tensor([*betas, *(math.log(math.expm1(value)) for value in (*gammas, _START_TAU))]))
 
     @property
     def shape(self) -> list[tuple[int, ...]]:
@@ -51,7 +70,10 @@ class Network(nn.Module):
 
     def forward(self, guides: Tensor) -> Tensor:
         """Guides (N, C, h, w) to raw heads (N, heads, h, w)."""
-        x = guides.contiguous(memory_format=torch.channels_last)
+        x = guides
+        if self.log_radiance:
+            x = torch.cat([x[:, :3].log1p(), x[:, 3:-3], x[:, -3:].log1p()], 1)
+        x = x.contiguous(memory_format=torch.channels_last)
         *hidden, last = self.convolutions
         for convolution in hidden:
             x = torch.relu_(convolution(x))

@@ -52,11 +52,31 @@ class Settings:
     stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
     epochs: int = _setting(20, "passes over all patches", f"{_PAPER}, Sec. 4", least=0)
-    learning_rate: float = _setting(
-        0.01, "Adam's rate over the root of the halves' variance", f"{_PAPER}, published code"
+    steps: int = _setting(0, "optimiser steps on patches drawn at random; 0 counts epochs", f"{_PAPER}, Sec. 4")
+    learning_rate: float = _setting(0.01, "Adam's rate", f"{_PAPER}, published code")
+    rate_from_variance: bool = _setting(
+        True, "multiply the rate by the root of the halves' variance", f"{_PAPER}, published code"
     )
+    schedule: str = _setting(
+        "constant", "of the rate over the steps", f"{_PAPER}, Sec. 4", choices=("constant", "cosine")
+    )
+    gradient_limit: float = _setting(0.0, "largest norm of the gradient; 0 sets none", f"{_PAPER}, Sec. 4")
     adam_epsilon: float = _setting(1e-7, "Adam's epsilon", f"{_PAPER}, published code")
     loss_epsilon: float = _setting(0.01, "added to the squared radiance in the loss", f"{_PAPER}, Eq. 8", least=1e-12)
+    input_scale: float = _setting(
+        1.0, "what radiance is multiplied by before all else; 0 brings the frame's mean near 1", f"{_PAPER}, Sec. 4"
+    )
+    log_radiance: bool = _setting(False, "show the network ln(1 + radiance)", f"{_PAPER}, Sec. 4")
+    initialisation: str = _setting(
+        "glorot",
+        "of the network: glorot, or residual, whose first output is the denoised image plus the local mean residual",
+        f"{_PAPER}, Sec. 4",
+        choices=("glorot", "residual"),
+    )
+    inference: str = _setting(
+        "halves", "denoised image that the result is inferred with", f"{_PAPER}, Eq. 10", choices=("halves", "full")
+    )
+    guard: bool = _setting(False, "blend with the denoised image as far as the halves bear it out", f"{_PAPER}, none")
     seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
 
     def __post_init__(self) -> None:
@@ -64,13 +84,34 @@ class Settings:
             _check(f.name, getattr(self, f.name), type(f.default), f.metadata)
         if self.window % 2 == 0 or self.window > 31:
             raise SettingsError(f"expected an odd window of at most 31, but got {self.window}")
-        if self.stride > self.patch:
+        if not self.steps and self.stride > self.patch:
             raise SettingsError(f"expected a stride of at most the patch ({self.patch}), but got {self.stride}")
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
         """Every preset by its name; the first is the default."""
-        return {"paper": cls()}
+        return {
+            "balanced": cls(
+                patch=64,
+                batch=4,
+                steps=400,
+                learning_rate=1e-3,
+                rate_from_variance=False,
+                schedule="cosine",
+                gradient_limit=1.0,
+                input_scale=0.0,
+                log_radiance=True,
+                initialisation="residual",
+                inference="full",
+                guard=True,
+            ),
+            "paper": cls(),
+        }
+
+    @classmethod
+    def default(cls) -> str:
+        """Name of the default preset."""
+        return next(iter(cls.presets()))
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> Self:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,23 @@ import pytest
 
 from selfcorrect import Settings, cli, exr
 
-FAST = ["--patch", "32", "--stride", "16", "--epochs", "1", "--window", "5", "--denoiser", "box", "--threads", "1"]
+BALANCED = ["--steps", "4", "--patch", "16", "--batch", "2", "--window", "5", "--denoiser", "box", "--threads", "1"]
+PAPER = ["--preset", "paper"]
+FAST = [
+    "--patch",
+    "32",
+    "--stride",
+    "16",
+    "--epochs",
+    "1",
+    "--window",
+    "5",
+    *PAPER,
+    "--denoiser",
+    "box",
+    "--threads",
+    "1",
+]
 
 
 def write_half(path: Path, seed: int, size: tuple[int, int] = (24, 30), **extra: Any) -> Path:
@@ -100,6 +117,34 @@ def test_repairs_are_counted_in_the_log(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "color: 3 pixels were NaN or infinite, 1 negative; repaired" in result.stderr
     assert np.isfinite(exr.read(str(tmp_path / "out.exr")).pixels("R")).all()
+
+
+def test_estimate_and_its_maps(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out.exr"
+    result = run("frame", *halves, "-o", out, *BALANCED, "--aov", "error,blend", "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["preset"] == Settings.default()
+    assert set(report["estimate"]) == {"noisy", "denoised", "corrected", "change", "standard_error", "improved"}
+    assert "relMSE ≈ " in result.stderr
+    after = exr.read(str(out))
+    assert json.loads(after.parts[0].header["selfcorrect/run"])["estimate"] == report["estimate"]
+    blend = after.pixels("selfcorrect.blend")
+    assert 0 <= blend.min() <= blend.max() <= 1
+    assert after.pixels("selfcorrect.error.after").mean() <= after.pixels("selfcorrect.error.before").mean()
+
+
+def test_no_guard_takes_the_corrected_image_as_it_is(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    result = run("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--no-guard", "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["estimate"] is None
+
+
+def test_identical_halves_are_warned_of(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    shutil.copy(halves[0], tmp_path / "copy.exr")
+    result = run("frame", halves[0], tmp_path / "copy.exr", "-o", tmp_path / "out.exr", *BALANCED)
+    assert result.returncode == 0, result.stderr
+    assert "warning: the halves are identical" in result.stderr
 
 
 def test_inspect(halves: tuple[Path, Path]) -> None:
@@ -189,6 +234,7 @@ class TestBadInput:
             (["--map", "albedo"], "ROLE=CHANNEL"),
             (["--map", "albedo=Nonsense"], "Nonsense"),
             (["--map", "nonsense=R"], "nonsense"),
+            (["--aov", "nonsense"], "nonsense"),
             (["--denoised-a", "none.exr"], "both denoised halves"),
         ],
     )

@@ -112,9 +112,11 @@ def test_eq3_fixes_the_scales() -> None:
 
 
 def test_learning_rate_is_a_hundredth_of_the_halves_deviation() -> None:
-    a, b = torch.rand(5, 6, 3), torch.rand(5, 6, 3)
+    guides = (full_guides(seed=1), full_guides(seed=2))
+    a, b = (half.planes[:3, 9:-9, 9:-25] for half in guides)
+    assert a.shape == (3, 12, 10)
     expected = 0.01 * math.sqrt(float((a - b).square().mean()) / 4)
-    assert learning_rate(a, b, PAPER.learning_rate) == pytest.approx(expected, rel=1e-6)
+    assert learning_rate(guides, PAPER) == pytest.approx(expected, rel=1e-6)
 
 
 def test_loss_is_eq8() -> None:

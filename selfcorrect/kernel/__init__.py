@@ -9,9 +9,9 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.kernel import cpu, reference
-from selfcorrect.kernel.guides import Guides
+from selfcorrect.kernel.guides import LARGEST, Guides
 
-__all__ = ["Guides", "cross_bilateral", "cross_bilateral_loss", "heads_count"]
+__all__ = ["LARGEST", "Guides", "cross_bilateral", "cross_bilateral_loss", "heads_count"]
 
 LARGEST_WINDOW = 31
 

@@ -70,6 +70,12 @@ class Guides:
         return 2 + self.has_albedo + self.has_normal + self.has_visibility
 
     @property
+    def inner(self) -> Tensor:
+        """All planes without their margin, (C, H, W)."""
+        m = self.margin
+        return self.planes[:, m : m + self.height, m : m + self.width]
+
+    @property
     def radiance(self) -> Tensor:
         """The planes of y, (3, …)."""
         return self.planes[:3]

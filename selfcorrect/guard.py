@@ -1,0 +1,195 @@
+"""Never worse than the denoised input: a blend that each half's witness decides.
+
+The halves are independent, so y^b is an unbiased witness of what the denoised z^a and the corrected g^a should have
+been. For the blend z + α (g − z) the error is a parabola in α whose two coefficients need no reference:
+
+    n = w (y^b − z^a)·(g^a − z^a),   d = w ‖g^a − z^a‖²,   w = 1 / (mean_rgb(z)² + 0.01)
+
+averaged over pixels and summed over both directions; its minimum is α = n / d. Locally n is mostly noise, and a single
+firefly in the witness can turn its sign. So the evidence is pooled from coarse to fine: the whole frame first, then
+tiles of 128, 64, 32 and 16 pixels. Each level starts from what the level above found, moves as far as its own evidence
+is certain, and then takes off one standard error.
+
+Measured with `scripts/bench_quality.py`; README has the numbers.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+__all__ = ["Estimate", "Guarded", "guard", "keep_light"]
+
+_LEVELS = (128, 64, 32, 16)  # sides of the tiles
+_PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
+_ERROR_TILE = 16  # pixels whose evidence may be correlated: standard errors are taken over tiles of this side
+_LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
+
+Pair = tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Errors estimated without a reference, as relMSE, and the gain.
+
+    Attributes:
+        noisy: of the mean of the halves.
+        denoised: of the denoised image.
+        corrected: of the output.
+        change: corrected over denoised, minus 1; negative is better.
+        standard_error: of ``change``.
+        improved: whether the evidence says that the output is better; if not, the output is the denoised image.
+    """
+
+    noisy: float
+    denoised: float
+    corrected: float
+    change: float
+    standard_error: float
+    improved: bool
+
+    def __str__(self) -> str:
+        if not self.improved:
+            return f"relMSE ≈ {self.denoised:.3g}: the evidence shows no gain, the denoised image is kept"
+        errors = f"{self.denoised:.3g} → {self.corrected:.3g}"
+        return f"relMSE ≈ {errors} ({100 * self.change:+.0f} ± {100 * self.standard_error:.0f} %)"
+
+
+@dataclass(frozen=True, eq=False)
+class Guarded:
+    """The blend and what decided it.
+
+    Attributes:
+        image: (H, W, 3), linear radiance.
+        alpha: weight of the corrected image, (H, W), 0 … 1.
+        estimate: of what was gained.
+        errors: estimated relative squared error of each pixel of the denoised image and of the blend, smoothed over
+            16 pixels, (2, H, W).
+    """
+
+    image: Tensor
+    alpha: Tensor
+    estimate: Estimate
+    errors: Tensor
+
+
+def guard(
+    color: Pair, denoised: Pair, corrected: Pair, denoised_full: Tensor, corrected_full: Tensor, *, scale: float = 1.0
+) -> Guarded:
+    """Blend the corrected image into the denoised one as far as the halves bear it out.
+
+    Args:
+        color: noisy halves, (H, W, 3) each, linear radiance of a mean near 1.
+        denoised: denoised halves.
+        corrected: each half corrected with its own denoised half: no half has seen its witness but through the
+            network's 20,303 weights.
+        denoised_full: denoised mean of the halves.
+        corrected_full: the corrected image to blend in.
+        scale: what the radiance was multiplied by; the estimate is that of the frame before.
+    """
+    y, z, g = ((pair[0].double(), pair[1].double()) for pair in (color, denoised, corrected))
+    full = denoised_full.double()
+    weight = 1.0 / (full.mean(-1) ** 2 + 0.01)
+    change = [g[i] - z[i] for i in (0, 1)]
+    n = [weight * ((y[1 - i] - z[i]) * change[i]).mean(-1) for i in (0, 1)]
+    d = [weight * (change[i] ** 2).mean(-1) for i in (0, 1)]
+
+    # What each direction alone would choose is judged by the other, which had no part in the choice.
+    gains = []
+    for i in (0, 1):
+        chosen = _pooled(n[i], d[i])
+        gains.append(2 * chosen * n[1 - i] - chosen**2 * d[1 - i])
+    gain = (gains[0] + gains[1]) / 2
+    error = _tile_error(gain)
+    improved = float(gain.mean()) > error
+
+    alpha = _pooled(n[0] + n[1], d[0] + d[1]) if improved else torch.zeros_like(weight)
+    image = full + alpha[..., None] * (corrected_full.double() - full)
+    own = 1.0 / (full.mean(-1) ** 2 + 0.01 * scale**2)  # the metric's weight in the frame's own units
+    gained = gain * own / weight if improved else gain * 0.0
+    error_of_half, spread, noise = _errors(y, z, own)
+    # No denoised image is known better than the spread of its halves.
+    half = max(float(error_of_half.mean()), float(spread.mean()) / 2, float(gained.mean()))
+    denoised_error = half - float(spread.mean()) / 4
+    ratio = float(gained.mean()) / half if half > 0 else 0.0
+    estimate = Estimate(
+        noisy=float(noise.mean()),
+        denoised=denoised_error,
+        corrected=denoised_error * (1 - ratio),
+        change=-ratio,
+        standard_error=_tile_error(gained) / half if half > 0 else 0.0,
+        improved=improved,
+    )
+    before = error_of_half - spread / 4
+    errors = torch.stack([_smooth(before).clamp(min=0), _smooth(before - gained).clamp(min=0)])
+    dtype = denoised_full.dtype
+    return Guarded(image.to(dtype), alpha.to(dtype), estimate, errors.to(dtype))
+
+
+def _pooled(n: Tensor, d: Tensor) -> Tensor:
+    """α of each pixel from evidence pooled over the frame, then over ever smaller tiles."""
+    floor = torch.finfo(torch.float64).tiny
+    certain = n.mean() - _tile_error(n)
+    alpha = (certain / d.mean().clamp(min=floor)).clamp(0, 1).expand_as(n)
+    for side in _LEVELS:
+        if side > max(n.shape):
+            continue
+        around = _means(alpha, side)
+        evidence, curvature = _means(n, side), _means(d, side)
+        variance = _means((n - alpha * d) ** 2, side) / side**2
+        ridge = variance / (_PRIOR_VARIANCE * curvature).clamp(min=floor)
+        moved = (evidence + ridge * around - variance.sqrt()) / (curvature + ridge).clamp(min=floor)
+        alpha = F.interpolate(moved.clamp(0, 1)[None, None], size=n.shape, mode="bilinear")[0, 0]
+    return alpha
+
+
+def _means(image: Tensor, side: int) -> Tensor:
+    """Means over tiles; those at the far border are smaller."""
+    return F.avg_pool2d(image[None, None], side, ceil_mode=True, count_include_pad=False)[0, 0]
+
+
+def _tile_error(image: Tensor) -> float:
+    """Standard error of the mean, over tiles as independent draws; of a single tile, the mean's own size."""
+    tiles = _means(image, _ERROR_TILE).flatten()
+    if len(tiles) == 1:
+        return float(tiles.abs())
+    return float(tiles.std()) / math.sqrt(len(tiles))
+
+
+def _smooth(image: Tensor) -> Tensor:
+    means = _means(image, _ERROR_TILE)
+    return F.interpolate(means[None, None], size=image.shape, mode="bilinear")[0, 0]
+
+
+def _errors(y: Pair, z: Pair, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Relative squared error of a denoised half, spread between the denoised halves, noise of the mean of the halves.
+
+    Each is unbiased where it is averaged: E‖z^a − y^b‖² is the error of z^a plus the variance of y^b (Eq. 6). The full
+    buffer has half of a half's variance, so that a quarter of the spread has to come off; what its smaller bias brings
+    is not seen, and the estimate for the full buffer is an upper one.
+    """
+    between = weight * ((y[0] - y[1]) ** 2).mean(-1)
+    crossed = weight * ((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2).mean(-1) / 2
+    spread = weight * ((z[0] - z[1]) ** 2).mean(-1)
+    return crossed - between / 2, spread, between / 4
+
+
+def keep_light(image: Tensor, color: Pair) -> Tensor:
+    """Scale the image so that its mean lies within three standard errors of the noisy mean.
+
+    Corrections learned from a loss that has not seen every bright path lose light; the noisy mean has not.
+    """
+    noisy = ((color[0] + color[1]) / 2).double().mean(-1)
+    mean, target = float(image.double().mean()), float(noisy.mean())
+    within = _LIGHT_TOLERANCE * _tile_error_of_noise(color)
+    if mean <= 0 or abs(mean - target) <= within:
+        return image
+    return image * ((target + within if mean > target else target - within) / mean)
+
+
+def _tile_error_of_noise(color: Pair) -> float:
+    """Standard error of the mean radiance of both halves."""
+    difference = (color[0].double() - color[1].double()).mean(-1) / 2
+    return math.sqrt(float((difference**2).mean()) / difference.numel())

@@ -1,0 +1,124 @@
+"""The guard: takes what is better where it is better, and nothing else; its estimate is what it claims."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from selfcorrect.guard import Guarded, guard, keep_light
+
+SIZE = (160, 192)
+
+
+def scene(seed: int = 0) -> Tensor:
+    """A smooth image of mean near 1 with fine stripes."""
+    y, x = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
+    stripes = 0.2 * torch.sin(1.9 * x + 0.3 * y)
+    return (1 + 0.3 * torch.sin(y / 40) + stripes)[..., None].expand(*SIZE, 3).contiguous()
+
+
+def noise(sigma: float, seed: int) -> Tensor:
+    return sigma * torch.randn(*SIZE, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def run(corrected_error: Tensor, *, sigma: float = 0.5, seed: int = 0, fireflies: int = 0) -> tuple[Guarded, Tensor]:
+    """Guard between a denoised image that lost its stripes and one with ``corrected_error``; returns the truth too."""
+    truth = scene()
+    smooth = (1 + 0.3 * torch.sin(torch.arange(SIZE[0]) / 40))[:, None, None].expand(*SIZE, 3)
+    color = [truth + noise(sigma, 10 * seed + i) for i in (1, 2)]
+    if fireflies:
+        generator = torch.Generator().manual_seed(seed)
+        for half in color:
+            where = torch.randint(0, SIZE[0] * SIZE[1], (fireflies,), generator=generator)
+            half.reshape(-1, 3)[where] += 300.0
+    denoised = [smooth + noise(0.02, 10 * seed + i) for i in (3, 4)]
+    corrected = [truth + corrected_error + noise(0.02, 10 * seed + i) for i in (5, 6)]
+    full, corrected_full = ((pair[0] + pair[1]) / 2 for pair in (denoised, corrected))
+    return guard(tuple(color), tuple(denoised), tuple(corrected), full, corrected_full), truth
+
+
+def error(image: Tensor, truth: Tensor) -> float:
+    return float(((image - truth) ** 2).mean())
+
+
+def denoised_error() -> float:
+    return 0.02  # stripes of amplitude 0.2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_better_image_is_taken(seed: int) -> None:
+    guarded, truth = run(torch.zeros(*SIZE, 3), seed=seed)
+    assert guarded.estimate.improved
+    assert error(guarded.image, truth) < 0.15 * denoised_error()
+    assert guarded.estimate.change < -0.7
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("size", [0.3, 1.0, 30.0])
+def test_a_worse_image_is_left(size: float, seed: int) -> None:
+    """Errors of the corrected image that have nothing to do with those of the denoised one."""
+    guarded, truth = run(noise(size, 99), seed=seed)
+    assert error(guarded.image, truth) < 1.02 * denoised_error()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_only_the_better_part_is_taken(seed: int) -> None:
+    worse = noise(1.0, 98)
+    worse[:, : SIZE[1] // 2] = 0
+    guarded, truth = run(worse, seed=seed)
+    left, right = guarded.alpha[:, : SIZE[1] // 2 - 16], guarded.alpha[:, SIZE[1] // 2 + 16 :]
+    assert left.mean() > 0.8
+    assert right.mean() < 0.15
+    assert error(guarded.image, truth) < 0.7 * denoised_error()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_fireflies_in_the_witness_do_no_harm(size: float, seed: int) -> None:
+    guarded, truth = run(noise(size, 97), seed=seed, fireflies=40)
+    assert error(guarded.image, truth) < 1.02 * denoised_error()
+
+
+def test_nothing_to_gain_gives_the_denoised_image() -> None:
+    color = (scene() + noise(0.3, 1), scene() + noise(0.3, 2))
+    denoised = (scene(), scene())
+    guarded = guard(color, denoised, denoised, scene(), scene())
+    assert not guarded.estimate.improved
+    assert torch.equal(guarded.image, scene())
+    assert guarded.alpha.eq(0).all()
+    assert "no gain" in str(guarded.estimate)
+
+
+def test_the_estimate_of_the_halves_is_unbiased() -> None:
+    """Denoised images that do not depend on the noise: the true error is known."""
+    truth = scene()
+    for seed in range(3):
+        guarded, _ = run(torch.zeros(*SIZE, 3), sigma=0.3, seed=seed)
+        smooth = (1 + 0.3 * torch.sin(torch.arange(SIZE[0]) / 40))[:, None, None].expand(*SIZE, 3)
+        weight = 1 / (smooth.mean(-1) ** 2 + 0.01)
+        true = float((weight[..., None] * (smooth - truth) ** 2).mean())
+        assert guarded.estimate.denoised == pytest.approx(true, rel=0.1)
+        assert guarded.estimate.noisy == pytest.approx(float(weight.mean()) * 0.3**2 / 2, rel=0.05)
+        assert guarded.errors[0].mean() == pytest.approx(true, rel=0.15)
+        assert guarded.errors[1].mean() < 0.5 * guarded.errors[0].mean()
+
+
+def test_the_estimate_is_in_the_units_of_the_frame() -> None:
+    """A frame of a tenth of the radiance, scaled by ten before the guard, has the relMSE of the dark frame."""
+    truth = scene()
+    color = (truth + noise(0.3, 1), truth + noise(0.3, 2))
+    denoised = (truth + 0.1, truth + 0.1)
+    guarded = guard(color, denoised, (truth, truth), denoised[0], truth, scale=10.0)
+    weight = 1 / ((denoised[0] / 10).mean(-1) ** 2 + 0.01)
+    assert guarded.estimate.denoised == pytest.approx(float((weight * 0.01**2).mean()), rel=0.1)
+
+
+def test_light_is_kept() -> None:
+    color = (scene() + noise(0.1, 1), scene() + noise(0.1, 2))
+    mean = float((color[0] + color[1]).mean() / 2)
+    certainty = 0.1 / 2**0.5 / (SIZE[0] * SIZE[1] * 3) ** 0.5
+    for factor in (0.9, 1.1):
+        kept = keep_light(scene() * factor, color)
+        assert float(kept.mean()) == pytest.approx(mean, abs=3.2 * certainty)
+    assert torch.equal(keep_light(scene(), color), scene())
+    black = torch.zeros(*SIZE, 3)
+    assert torch.equal(keep_light(black, color), black)
