@@ -21,6 +21,7 @@ from selfcorrect.loss import dual_buffer_loss
 from selfcorrect.network import Network
 
 WINDOW = 19
+PATCH = 128  # the paper's
 
 
 def processor() -> str:
@@ -119,11 +120,11 @@ def main() -> None:
     print(f"{processor()}; torch {torch.__version__}; window {WINDOW}, all 13 channels")
     print("ns per pixel, tap and buffer, forward + backward (best of runs)")
     for threads in (1, 2):
-        unfold = nanoseconds("unfold", 64, threads, 2)
-        shift = nanoseconds("shift", 128, threads, 1)
+        unfold = nanoseconds("unfold", PATCH, threads, 2)
+        shift = nanoseconds("shift", PATCH, threads, 2)
         print(f"{threads} thread(s)  reference: unfold {unfold:.1f}, shift loop {shift:.1f}")
         for isa in cpu.instruction_sets():
-            value = nanoseconds(isa, 256, threads, options.repeat)
+            value = nanoseconds(isa, PATCH, threads, options.repeat)
             print(f"  {isa:9} {value:6.2f}   {unfold / value:6.0f}x unfold  {shift / value:5.0f}x shift loop")
     if not options.no_run:
         torch.set_num_threads(2)

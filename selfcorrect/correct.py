@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError
-from selfcorrect.frame import Frame, Half
+from selfcorrect.frame import Frame, Half, mean
 from selfcorrect.guard import Estimate, Guarded, guard, keep_light
 from selfcorrect.kernel import LARGEST, Guides, cross_bilateral
 from selfcorrect.network import Network
@@ -66,6 +66,8 @@ def correct(
         FrameError: the frame has no denoised halves, or ``warm_start`` was trained with other buffers or settings.
     """
     settings = settings or Settings.preset(Settings.default())
+    if frame.denoised is None:
+        raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
     start = time.perf_counter()
     scale = settings.input_scale or _automatic_scale(frame)
     halves = _scaled(frame, scale)
@@ -97,11 +99,9 @@ def _automatic_scale(frame: Frame) -> float:
 
 def _scaled(frame: Frame, scale: float) -> tuple[Half, Half]:
     """Both halves with their radiance scaled, and bounded so that its squares stay finite."""
-    if frame.denoised is None:
-        raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
 
     def one(half: Half) -> Half:
-        assert half.denoised is not None
+        assert half.denoised is not None  # correct() has checked; tells the type checker
         return half._replace(color=_bounded(half.color, scale), denoised=_bounded(half.denoised, scale))
 
     return one(frame.halves[0]), one(frame.halves[1])
@@ -133,11 +133,12 @@ def _finish(
     frame: Frame, halves: tuple[Half, Half], network: Network, settings: Settings, scale: float
 ) -> tuple[Tensor, Guarded | None]:
     """The result from the trained network, in the frame's own units."""
+    assert frame.denoised is not None
     assert halves[0].denoised is not None
     assert halves[1].denoised is not None
     denoised = (halves[0].denoised, halves[1].denoised)
     given = frame.denoised_full
-    full = (denoised[0] + denoised[1]) / 2 if given is None else _bounded(given, scale)
+    full = mean(denoised) if given is None else _bounded(given, scale)
 
     def infer(shown: Tensor | None) -> tuple[Tensor, Tensor]:
         return _infer(network, halves[0], shown, settings), _infer(network, halves[1], shown, settings)
@@ -145,16 +146,19 @@ def _finish(
     with_halves = infer(None) if settings.guard or settings.inference == "halves" else None
     with_full = infer(full) if settings.inference == "full" else with_halves
     assert with_full is not None
-    image = ((with_full[0] + with_full[1]) / 2).clamp(min=0)
+    image = mean(with_full).clamp(min=0)
     if not settings.guard:
-        return image / scale, None
+        return _unscaled(image, scale), None
     assert with_halves is not None
     color = (halves[0].color, halves[1].color)
     guarded = guard(color, denoised, with_halves, full, image, scale=scale)
     if not guarded.estimate.improved:
-        untouched = (frame.denoised[0] + frame.denoised[1]) / 2 if given is None and frame.denoised else given
-        return untouched, guarded
-    return keep_light(guarded.image, color) / scale, guarded
+        return (mean(frame.denoised) if given is None else given), guarded
+    return _unscaled(keep_light(guarded.image, full, color), scale), guarded
+
+
+def _unscaled(image: Tensor, scale: float) -> Tensor:
+    return (image.double() / scale).clamp(0, torch.finfo(torch.float32).max).float()
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError
 
-__all__ = ["Frame", "Half", "Repairs"]
+__all__ = ["Frame", "Half", "Repairs", "mean"]
 
 Pair = tuple[Any, Any]
 _CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 1, "depth": 1}
@@ -125,8 +125,10 @@ class Frame:
         """
         inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
         pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
-        mean = [None if a is None or b is None else (a + b) / 2 for a, b in zip(*inputs, strict=True)]
-        return self.with_denoised(pair, denoiser(mean[0], albedo=mean[1], normal=mean[2]) if full else None)
+        if not full:
+            return self.with_denoised(pair)
+        color, albedo, normal = (None if a is None else mean((a, b)) for a, b in zip(*inputs, strict=True))
+        return self.with_denoised(pair, denoiser(color, albedo=albedo, normal=normal))
 
     def with_denoised(self, denoised: Pair, denoised_full: Any = None) -> "Frame":
         """This frame with these denoised images; its other buffers are not checked again."""
@@ -153,24 +155,36 @@ class Frame:
     def like_input(self, image: Tensor) -> Any:
         """``image`` as the kind of array, and on the device, that the colour of half a was given in."""
         if isinstance(self._like, Tensor):
-            return image.to(self._like.device, self._like.dtype)
-        return image.cpu().numpy().astype(np.asarray(self._like).dtype)
+            limit = min(torch.finfo(self._like.dtype).max, torch.finfo(image.dtype).max)
+            return image.clamp(max=limit).to(self._like.device, self._like.dtype)
+        dtype = np.asarray(self._like).dtype
+        limit = min(float(np.finfo(dtype).max), torch.finfo(image.dtype).max)
+        return image.clamp(max=limit).cpu().numpy().astype(dtype)
+
+
+def mean(pair: Pair) -> Tensor:
+    """Mean of both halves; in float64, as the sum of two large values may exceed float32."""
+    average: Tensor = ((pair[0].double() + pair[1].double()) / 2).to(pair[0].dtype)
+    return average
 
 
 def _as_tensor(array: Any, what: str, channels: int) -> Tensor:
-    tensor = array.detach() if isinstance(array, Tensor) else torch.from_numpy(np.array(array, order="C"))
+    if isinstance(array, Tensor):
+        tensor = array.detach()
+    else:
+        values = np.asarray(array)
+        tensor = torch.from_numpy(np.array(values, dtype=values.dtype.newbyteorder("="), order="C"))
     if not tensor.is_floating_point():
         raise FrameError(f"expected {what} as floating-point numbers, but got {tensor.dtype}")
     if tensor.ndim == 2 and channels == 1:
         tensor = tensor[:, :, None]
     if tensor.ndim != 3 or tensor.shape[2] != channels or 0 in tensor.shape:
         raise FrameError(f"expected {what} of shape (H, W, {channels}), but got {tuple(tensor.shape)}")
-    # float64 beyond the range of float32 would turn into an infinity that the render does not have
-    return (
-        tensor.clamp(torch.finfo(torch.float32).min, torch.finfo(torch.float32).max).float()
-        if (tensor.dtype == torch.float64)
-        else tensor.float()
-    )
+    if tensor.dtype == torch.float64:
+        # what float32 cannot hold must not turn into an infinity that the render does not have
+        largest = torch.finfo(torch.float32).max
+        tensor = torch.where(tensor.isfinite(), tensor.clamp(-largest, largest), tensor)
+    return tensor.float()
 
 
 def _repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:

@@ -26,6 +26,7 @@ _LEVELS = (128, 64, 32, 16)  # sides of the tiles
 _PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
 _ERROR_TILE = 16  # pixels whose evidence may be correlated: standard errors are taken over tiles of this side
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
+_LARGEST_SCALE = 1.05  # of the whole image, to keep its light
 
 Pair = tuple[Tensor, Tensor]
 
@@ -91,24 +92,26 @@ def guard(
     """
     y, z, g = ((pair[0].double(), pair[1].double()) for pair in (color, denoised, corrected))
     full = denoised_full.double()
-    weight = 1.0 / (full.mean(-1) ** 2 + 0.01)
     change = [g[i] - z[i] for i in (0, 1)]
-    n = [weight * ((y[1 - i] - z[i]) * change[i]).mean(-1) for i in (0, 1)]
-    d = [weight * (change[i] ** 2).mean(-1) for i in (0, 1)]
+    # The weight must not know the witness: low where the witness is high, it would reward darkening.
+    weight = [1.0 / (z[i].mean(-1) ** 2 + 0.01) for i in (0, 1)]
+    n = [weight[i] * ((y[1 - i] - z[i]) * change[i]).mean(-1) for i in (0, 1)]
+    d = [weight[i] * (change[i] ** 2).mean(-1) for i in (0, 1)]
 
-    # What each direction alone would choose is judged by the other, which had no part in the choice.
-    gains = []
+    # What one direction alone would choose is judged by the witness of the other.
+    own = 1.0 / (full.mean(-1) ** 2 + 0.01 * scale**2)  # the metric's weight, in the frame's own units
+    gain, gain_in_own = torch.zeros_like(own), torch.zeros_like(own)
     for i in (0, 1):
         chosen = _pooled(n[i], d[i])
-        gains.append(2 * chosen * n[1 - i] - chosen**2 * d[1 - i])
-    gain = (gains[0] + gains[1]) / 2
-    error = _tile_error(gain)
-    improved = float(gain.mean()) > error
+        judged = chosen * n[1 - i] - chosen**2 * d[1 - i] / 2
+        gain += judged
+        gain_in_own += judged * own / weight[1 - i]
+    # More than chance, in the weights that decide and in those of the metric.
+    improved = float(gain.mean()) > _tile_error(gain) and float(gain_in_own.mean()) > 0
 
-    alpha = _pooled(n[0] + n[1], d[0] + d[1]) if improved else torch.zeros_like(weight)
+    alpha = _pooled(n[0] + n[1], d[0] + d[1]) if improved else torch.zeros_like(own)
     image = full + alpha[..., None] * (corrected_full.double() - full)
-    own = 1.0 / (full.mean(-1) ** 2 + 0.01 * scale**2)  # the metric's weight in the frame's own units
-    gained = gain * own / weight if improved else gain * 0.0
+    gained = gain_in_own if improved else torch.zeros_like(own)
     error_of_half, spread, noise = _errors(y, z, own)
     # No denoised image is known better than the spread of its halves.
     half = max(float(error_of_half.mean()), float(spread.mean()) / 2, float(gained.mean()))
@@ -123,8 +126,8 @@ def guard(
         improved=improved,
     )
     before = error_of_half - spread / 4
-    errors = torch.stack([_smooth(before).clamp(min=0), _smooth(before - gained).clamp(min=0)])
     dtype = denoised_full.dtype
+    errors = torch.stack([_smooth(before), _smooth(before - gained)]).clamp(0, torch.finfo(dtype).max)
     return Guarded(image.to(dtype), alpha.to(dtype), estimate, errors.to(dtype))
 
 
@@ -176,20 +179,29 @@ def _errors(y: Pair, z: Pair, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return crossed - between / 2, spread, between / 4
 
 
-def keep_light(image: Tensor, color: Pair) -> Tensor:
-    """Scale the image so that its mean lies within three standard errors of the noisy mean.
+def keep_light(image: Tensor, denoised: Tensor, color: Pair) -> Tensor:
+    """Bring the image's mean radiance to within three standard errors of the noisy mean.
 
-    Corrections learned from a loss that has not seen every bright path lose light; the noisy mean has not.
+    Corrections learned from a loss that has not seen every bright path lose light; the noisy mean has not. Small
+    losses are scaled away. For what a twentieth of scaling does not reach, the image first goes towards the denoised
+    one, where that has kept more light: a scale knows nothing of where the light was lost.
     """
-    noisy = ((color[0] + color[1]) / 2).double().mean(-1)
-    mean, target = float(image.double().mean()), float(noisy.mean())
-    within = _LIGHT_TOLERANCE * _tile_error_of_noise(color)
+    noisy = (color[0].double() + color[1].double()) / 2
+    mean, target, kept = (float(x.double().mean()) for x in (image, noisy, denoised))
+    within = _LIGHT_TOLERANCE * _error_of_mean(color)
     if mean <= 0 or abs(mean - target) <= within:
         return image
-    return image * ((target + within if mean > target else target - within) / mean)
+    wanted = target + within if mean > target else target - within
+    result = image.double()
+    if abs(kept - target) < abs(mean - target):
+        reachable = min(max(mean, wanted / _LARGEST_SCALE), wanted * _LARGEST_SCALE)
+        share = min(1.0, (reachable - mean) / (kept - mean))
+        result = result + share * (denoised.double() - result)
+    scale = min(max(wanted / float(result.mean()), 1 / _LARGEST_SCALE), _LARGEST_SCALE)
+    return (result * scale).to(image.dtype)
 
 
-def _tile_error_of_noise(color: Pair) -> float:
+def _error_of_mean(color: Pair) -> float:
     """Standard error of the mean radiance of both halves."""
     difference = (color[0].double() - color[1].double()).mean(-1) / 2
     return math.sqrt(float((difference**2).mean()) / difference.numel())

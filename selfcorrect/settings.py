@@ -77,6 +77,9 @@ class Settings:
         "halves", "denoised image that the result is inferred with", f"{_PAPER}, Eq. 10", choices=("halves", "full")
     )
     guard: bool = _setting(False, "blend with the denoised image as far as the halves bear it out", f"{_PAPER}, none")
+    crossed_weights: bool = _setting(
+        False, "weigh a half's loss by its own denoised image, not by its witness's", f"{_PAPER}, Eq. 8"
+    )
     seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
 
     def __post_init__(self) -> None:
@@ -104,6 +107,7 @@ class Settings:
                 initialisation="residual",
                 inference="full",
                 guard=True,
+                crossed_weights=True,
             ),
             "paper": cls(),
         }

@@ -31,6 +31,8 @@ def train(
         Eq. 8 before each step. A step whose loss or gradient is not finite is not taken.
     """
     a, b = (relative_weight(half.denoised, settings.loss_epsilon) for half in guides)
+    if settings.crossed_weights:  # a weight that knows the witness rewards darkening
+        a, b = b, a
     size = (settings.patch, settings.patch)
     optimiser = torch.optim.Adam(network.parameters(), eps=settings.adam_epsilon)
     rate = learning_rate(guides, settings)

@@ -88,8 +88,8 @@ def corrected(frame: Frame, preset: Settings = BALANCED) -> Result:
     return result
 
 
-def assert_not_worse(frame: Frame, truth: Array) -> Result:
-    result = corrected(frame)
+def assert_not_worse(frame: Frame, truth: Array, settings: Settings = BALANCED) -> Result:
+    result = corrected(frame, settings)
     assert relmse(plain(result.image), truth) <= MARGIN * relmse(plain(frame.denoised_full), truth)
     return result
 
@@ -442,7 +442,10 @@ def test_denoiser_that_changes_the_light(left: float, guides: dict[str, Pair]) -
     assert frame.denoised is not None
     a, b = frame.denoised
     dimmed = frame.with_denoised((left * a, left * b), left * frame.denoised_full)
-    assert_light_kept(assert_not_worse(dimmed, scene()), dimmed)
+    # Half-trained, a network brings back the light but not the stripes, and the guard, whose weight is as flat as the
+    # denoised image, takes that for a gain: a quarter of the preset's 400 steps it must have.
+    settings = Settings.from_dict(BALANCED.to_dict() | {"steps": 100})
+    assert_light_kept(assert_not_worse(dimmed, scene(), settings), dimmed)
 
 
 # --- Exposure -----------------------------------------------------------------------------------------------------
