@@ -74,7 +74,8 @@ def row(options: argparse.Namespace, name: str, spp: int, denoiser: str, preset:
     estimated = f"{estimate.denoised:.5f} {estimate.corrected:.5f}" if estimate else "none"
     print(
         f"| {name} | {spp} | {before:.5f} | {denoised:.5f} | {np.mean(after):.5f} | {ratio:.3f} ± {error:.3f} "
-        f"| {min(after) / denoised:.3f} … {max(after) / denoised:.3f} | {means[0]:.4f} {means[1]:.4f} | {estimated} | {seconds:.1f} |",
+        f"| {min(after) / denoised:.3f} … {max(after) / denoised:.3f} | {means[0]:.4f} {means[1]:.4f} "
+        f"| {estimated} | {seconds:.1f} |",
         flush=True,
     )
     return ratio

@@ -4,7 +4,7 @@ Run it with the extra `render`, which brings Mitsuba 3 and Open Image Denoise; M
 LLVM shared library (`apt-get install libllvm19`; the variable DRJIT_LIBLLVM_PATH names it where it is not found)::
 
     pip install -e '.[render]'
-    python scripts/render_packaged_frame.py                                     # as shipped, about a quarter of an hour
+    python scripts/render_packaged_frame.py  # as shipped, about eight minutes on two cores
     python scripts/render_packaged_frame.py --out /tmp --size 128 --ref-spp 64  # a quick look
 
 It writes five half-float EXR files into --out:

@@ -26,7 +26,8 @@ _LEVELS = (128, 64, 32, 16)  # sides of the tiles
 _PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
 _ERROR_TILE = 16  # pixels whose evidence may be correlated: standard errors are taken over tiles of this side
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
-_LARGEST_SCALE = 1.05  # of the whole image, to keep its light
+_DARKEST = 0.01  # radiance; darker pixels weigh no more
+_LARGEST_SCALE = 1.02  # of the whole image, to keep its light
 
 Pair = tuple[Tensor, Tensor]
 
@@ -94,7 +95,7 @@ def guard(
     full = denoised_full.double()
     change = [g[i] - z[i] for i in (0, 1)]
     # The weight must not know the witness: low where the witness is high, it would reward darkening.
-    weight = [1.0 / (z[i].mean(-1) ** 2 + 0.01) for i in (0, 1)]
+    weight = [1.0 / (_level(z[i]) ** 2 + 0.01) for i in (0, 1)]
     n = [weight[i] * ((y[1 - i] - z[i]) * change[i]).mean(-1) for i in (0, 1)]
     d = [weight[i] * (change[i] ** 2).mean(-1) for i in (0, 1)]
 
@@ -159,6 +160,16 @@ def _tile_error(image: Tensor) -> float:
     if len(tiles) == 1:
         return float(tiles.abs())
     return float(tiles.std()) / math.sqrt(len(tiles))
+
+
+def _level(radiance: Tensor) -> Tensor:
+    """Radiance that the relative error counts from, (H, W): each pixel's own, at most the usual one around it.
+
+    A firefly that the denoiser has left is a large error in a dark place; its own radiance would give it no weight.
+    """
+    level = radiance.mean(-1)
+    around = _smooth(level.clamp(min=_DARKEST).log()).exp()
+    return torch.minimum(level, around)
 
 
 def _smooth(image: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from selfcorrect.errors import SettingsError
 __all__ = ["Settings"]
 
 _PAPER = "Back et al. 2022"
+_OURS = "not in the paper; scripts/bench_quality.py measures it"
 
 
 def _setting(default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0) -> Any:
@@ -52,33 +53,31 @@ class Settings:
     stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
     epochs: int = _setting(20, "passes over all patches", f"{_PAPER}, Sec. 4", least=0)
-    steps: int = _setting(0, "optimiser steps on patches drawn at random; 0 counts epochs", f"{_PAPER}, Sec. 4")
+    steps: int = _setting(0, "optimiser steps on patches drawn at random; 0 counts epochs", _OURS)
     learning_rate: float = _setting(0.01, "Adam's rate", f"{_PAPER}, published code")
     rate_from_variance: bool = _setting(
         True, "multiply the rate by the root of the halves' variance", f"{_PAPER}, published code"
     )
-    schedule: str = _setting(
-        "constant", "of the rate over the steps", f"{_PAPER}, Sec. 4", choices=("constant", "cosine")
-    )
-    gradient_limit: float = _setting(0.0, "largest norm of the gradient; 0 sets none", f"{_PAPER}, Sec. 4")
+    schedule: str = _setting("constant", "of the rate over the steps", _OURS, choices=("constant", "cosine"))
+    gradient_limit: float = _setting(0.0, "largest norm of the gradient; 0 sets none", _OURS)
     adam_epsilon: float = _setting(1e-7, "Adam's epsilon", f"{_PAPER}, published code")
     loss_epsilon: float = _setting(0.01, "added to the squared radiance in the loss", f"{_PAPER}, Eq. 8", least=1e-12)
     input_scale: float = _setting(
-        1.0, "what radiance is multiplied by before all else; 0 brings the frame's mean near 1", f"{_PAPER}, Sec. 4"
+        1.0, "what radiance is multiplied by before all else; 0 brings the frame's mean near 1", _OURS
     )
-    log_radiance: bool = _setting(False, "show the network ln(1 + radiance)", f"{_PAPER}, Sec. 4")
+    log_radiance: bool = _setting(False, "show the network ln(1 + radiance)", _OURS)
     initialisation: str = _setting(
         "glorot",
         "of the network: glorot, or residual, whose first output is the denoised image plus the local mean residual",
-        f"{_PAPER}, Sec. 4",
+        _OURS,
         choices=("glorot", "residual"),
     )
     inference: str = _setting(
-        "halves", "denoised image that the result is inferred with", f"{_PAPER}, Eq. 10", choices=("halves", "full")
+        "halves", "denoised image that the result is inferred with", f"{_PAPER}, Sec. 4", choices=("halves", "full")
     )
-    guard: bool = _setting(False, "blend with the denoised image as far as the halves bear it out", f"{_PAPER}, none")
+    guard: bool = _setting(False, "blend with the denoised image as far as the halves bear it out", _OURS)
     crossed_weights: bool = _setting(
-        False, "weigh a half's loss by its own denoised image, not by its witness's", f"{_PAPER}, Eq. 8"
+        False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
     seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
 
@@ -92,7 +91,11 @@ class Settings:
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        """Every preset by its name; the first is the default."""
+        """Every preset by its name; the first is the default.
+
+        ``paper`` is Back et al. 2022 as published. ``balanced`` is what `scripts/bench_quality.py` found on the
+        development frames: README has its table.
+        """
         return {
             "balanced": cls(
                 patch=64,
@@ -105,7 +108,6 @@ class Settings:
                 input_scale=0.0,
                 log_radiance=True,
                 initialisation="residual",
-                inference="full",
                 guard=True,
                 crossed_weights=True,
             ),

@@ -78,6 +78,33 @@ def test_small_frames(size: tuple[int, int]) -> None:
     assert np.isfinite(image).all()
 
 
+def test_the_default_preset_guards_and_estimates() -> None:
+    frame = make_frame(size=(64, 80), albedo=True)
+    settings = Settings.preset(Settings.default(), patch=32, steps=60, window=9)
+    assert settings.guard
+    result = correct(frame, settings)
+    assert result.estimate is not None
+    assert result.estimate.improved
+    assert set(result.aovs) == {"blend", "error.before", "error.after"}
+    assert all(map.shape == (64, 80) for map in result.aovs.values())
+    truth = 0.5 + 0.4 * np.sin(np.arange(80) * 1.5)[None, :, None]
+    before = float(np.mean((0.5 - truth) ** 2))
+    assert np.mean((result.image - truth) ** 2) < 0.5 * before
+
+
+def test_steps_are_counted() -> None:
+    settings = Settings.preset(Settings.default(), patch=16, steps=7, window=5)
+    assert len(correct(make_frame(), settings).losses) == 7
+
+
+def test_inference_with_the_full_buffer_uses_it() -> None:
+    frame = make_frame()
+    full = frame.with_denoised(frame.denoised, np.full((40, 36, 3), 0.7, np.float32))
+    changes = SMALL.to_dict() | {"inference": "full"}
+    with_full, with_halves = (correct(full, s).image for s in (Settings.from_dict(changes), SMALL))
+    assert np.abs(with_full - with_halves).max() > 1e-4
+
+
 def test_progress_is_told_every_step() -> None:
     calls: list[tuple[int, int, float]] = []
     result = correct(make_frame(), SMALL, progress=lambda *call: calls.append(call))
