@@ -194,8 +194,8 @@ def keep_light(image: Tensor, denoised: Tensor, color: Pair) -> Tensor:
     """Bring the image's mean radiance to within three standard errors of the noisy mean.
 
     Corrections learned from a loss that has not seen every bright path lose light; the noisy mean has not. Small
-    losses are scaled away. For what a twentieth of scaling does not reach, the image first goes towards the denoised
-    one, where that has kept more light: a scale knows nothing of where the light was lost.
+    losses are scaled away. For what two per cent of scaling do not reach, the image first goes towards the denoised
+    one, where that has kept more light: a scale knows nothing of where the light was lost, and enlarges all errors.
     """
     noisy = (color[0].double() + color[1].double()) / 2
     mean, target, kept = (float(x.double().mean()) for x in (image, noisy, denoised))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
+from test_denoisers_models import NCHW, sum_of
 
 from selfcorrect import Settings, cli, exr
 
@@ -240,6 +241,13 @@ class TestBadInput:
     )
     def test_flags(self, halves: tuple[Path, Path], tmp_path: Path, flags: list[str], word: str) -> None:
         assert word in refused("frame", *halves, "-o", tmp_path / "out.exr", *FAST, *flags)
+
+    def test_an_onnx_model_with_the_wrong_inputs(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        model = sum_of(tmp_path / "wrong.onnx", {"depth": NCHW, "motion": NCHW})
+        line = refused("frame", *halves, "-o", tmp_path / "out.exr", *FAST, "--denoiser", f"onnx:{model}")
+        assert "wrong.onnx" in line
+        assert "depth" in line
+        assert "expected" in line
 
     def test_no_command(self) -> None:
         assert "COMMAND" in refused()

@@ -116,9 +116,15 @@ def test_light_is_kept() -> None:
     color = (scene() + noise(0.1, 1), scene() + noise(0.1, 2))
     mean = float((color[0] + color[1]).mean() / 2)
     certainty = 0.1 / 2**0.5 / (SIZE[0] * SIZE[1] * 3) ** 0.5
-    for factor in (0.96, 1.04):
+    for factor in (0.985, 1.015):
         kept = keep_light(scene() * factor, scene() * factor, color)
         assert float(kept.mean()) == pytest.approx(mean, abs=3.2 * certainty)
+    for factor in (0.8, 1.2):
+        kept = keep_light(scene() * factor, scene(), color)
+        assert float(kept.mean()) == pytest.approx(mean, abs=3.2 * certainty), "the denoised image has kept the light"
+        alone = keep_light(scene() * factor, scene() * factor, color)
+        change = float(alone.mean() / scene().mean()) / factor
+        assert change == pytest.approx(1.02 if factor < 1 else 1 / 1.02, rel=1e-4), "never scaled by more"
     assert torch.equal(keep_light(scene(), scene(), color), scene())
     black = torch.zeros(*SIZE, 3)
     assert torch.equal(keep_light(black, scene(), color), black)
