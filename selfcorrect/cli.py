@@ -149,6 +149,8 @@ def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tu
     """Correct one frame from files to file; returns what --json prints, and the frame."""
     start = time.perf_counter()
     settings = _settings(options)
+    if options.aov and not settings.guard:
+        raise SettingsError(f"expected the guard with --aov {','.join(options.aov)}, but got settings that turn it off")
     _use_machine(options)
     exr.check_target(output)
     denoise = None
@@ -181,15 +183,22 @@ def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tu
         "settings": settings.to_dict(),
         **details,
         "channels": loaded.taken,
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
+        **_facts(frame, result),
+    }
+    return report, frame
+
+
+def _facts(frame: Frame, result: Result) -> dict[str, Any]:
+    """What --json tells of the frame and of the work done on it."""
+    return {
+        "size": {"width": frame.size[1], "height": frame.size[0]},
         "repairs": {name: repairs._asdict() for name, repairs in frame.repairs.items()},
         "input_scale": result.input_scale,
         "steps": len(result.losses),
-        "seconds": {name: round(value, 3) for name, value in seconds.items()},
-        "size": {"width": frame.size[1], "height": frame.size[0]},
         "parameters": sum(p.numel() for p in result.network.parameters()),
         "threads": torch.get_num_threads(),
     }
-    return report, frame
 
 
 def _denoised(

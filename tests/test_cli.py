@@ -236,6 +236,7 @@ class TestBadInput:
             (["--map", "albedo=Nonsense"], "Nonsense"),
             (["--map", "nonsense=R"], "nonsense"),
             (["--aov", "nonsense"], "nonsense"),
+            (["--aov", "blend"], "guard"),
             (["--denoised-a", "none.exr"], "both denoised halves"),
         ],
     )
