@@ -68,7 +68,16 @@ def nanoseconds(form: str, size: int, threads: int, repeat: int) -> float:
             loss = 0.5 * (g - cut).square().mean()
         else:
             loss = cpu.cross_bilateral_loss(
-                guides, raw, corners, target, weight, window=WINDOW, combination="eq10", threads=threads, isa=form
+                guides,
+                raw,
+                corners,
+                target,
+                weight,
+                window=WINDOW,
+                every=1,
+                combination="eq10",
+                threads=threads,
+                isa=form,
             )
         raw.grad = None
         loss.backward()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError
 from selfcorrect.frame import Frame, Half, mean
-from selfcorrect.guard import Estimate, Guarded, guard, keep_light
+from selfcorrect.guard import Estimate, Guarded, guard, keep_light, trust_in_full
 from selfcorrect.kernel import LARGEST, Guides, cross_bilateral
 from selfcorrect.network import Network
 from selfcorrect.patches import overhang
@@ -143,13 +143,13 @@ def _finish(
     def infer(shown: Tensor | None) -> tuple[Tensor, Tensor]:
         return _infer(network, halves[0], shown, settings), _infer(network, halves[1], shown, settings)
 
-    with_halves = infer(None) if settings.guard or settings.inference == "halves" else None
-    with_full = infer(full) if settings.inference == "full" else with_halves
-    assert with_full is not None
-    image = mean(with_full).clamp(min=0)
+    with_halves = infer(None)
+    image = mean(with_halves)
+    if settings.inference == "full":
+        image += trust_in_full(denoised, full).to(image.dtype) * (mean(infer(full)) - image)
+    image = image.clamp(min=0)
     if not settings.guard:
         return _unscaled(image, scale), None
-    assert with_halves is not None
     color = (halves[0].color, halves[1].color)
     guarded = guard(color, denoised, with_halves, full, image, scale=scale)
     if not guarded.estimate.improved:

@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["Estimate", "Guarded", "guard", "keep_light"]
+__all__ = ["Estimate", "Guarded", "guard", "keep_light", "trust_in_full"]
 
 _LEVELS = (128, 64, 32, 16)  # sides of the tiles
 _PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
@@ -28,6 +28,8 @@ _ERROR_TILE = 16  # pixels whose evidence may be correlated: standard errors are
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
 _LARGEST_SCALE = 1.02  # of the whole image, to keep its light
+_DISAGREEMENT = 0.5  # (max − min) / (max + min) of the denoised halves: one of them has left a firefly
+_BIAS_SHRINKS = 0.45  # how much of the denoiser's change with the noise is taken for a change of its bias
 
 Pair = tuple[Tensor, Tensor]
 
@@ -100,36 +102,68 @@ def guard(
     d = [weight[i] * (change[i] ** 2).mean(-1) for i in (0, 1)]
 
     # What one direction alone would choose is judged by the witness of the other.
-    own = 1.0 / (full.mean(-1) ** 2 + 0.01 * scale**2)  # the metric's weight, in the frame's own units
-    gain, gain_in_own = torch.zeros_like(own), torch.zeros_like(own)
+    gain, unweighted = torch.zeros_like(n[0]), torch.zeros_like(n[0])
     for i in (0, 1):
         chosen = _pooled(n[i], d[i])
         judged = chosen * n[1 - i] - chosen**2 * d[1 - i] / 2
         gain += judged
-        gain_in_own += judged * own / weight[1 - i]
+        unweighted += judged / weight[1 - i]
     # More than chance, in the weights that decide and in those of the metric.
-    improved = float(gain.mean()) > _tile_error(gain) and float(gain_in_own.mean()) > 0
+    improved = float(gain.mean()) > _tile_error(gain) and float((_metric_weight(full, scale) * unweighted).mean()) > 0
 
-    alpha = _pooled(n[0] + n[1], d[0] + d[1]) if improved else torch.zeros_like(own)
+    alpha = _pooled(n[0] + n[1], d[0] + d[1]) if improved else torch.zeros_like(gain)
     image = full + alpha[..., None] * (corrected_full.double() - full)
-    gained = gain_in_own if improved else torch.zeros_like(own)
-    error_of_half, spread, noise = _errors(y, z, own)
-    # No denoised image is known better than the spread of its halves.
-    half = max(float(error_of_half.mean()), float(spread.mean()) / 2, float(gained.mean()))
-    denoised_error = half - float(spread.mean()) / 4
+    # The best image there is says what errors are relative to: where the denoiser has left fireflies or blurred
+    # a lamp, its own radiance would hide its error.
+    own = _metric_weight(_shown(image), scale)
+    estimate, errors = _estimate(y, z, full, own, own * unweighted if improved else torch.zeros_like(gain), improved)
+    dtype = denoised_full.dtype
+    errors = errors.clamp(0, torch.finfo(dtype).max)
+    return Guarded(image.to(dtype), alpha.to(dtype), estimate, errors.to(dtype))
+
+
+def _metric_weight(radiance: Tensor, scale: float) -> Tensor:
+    """relMSE's 1 / (mean_rgb² + 0.01) of the frame in its own units, times 1 / scale²."""
+    return 1.0 / (radiance.mean(-1) ** 2 + 0.01 * scale**2)
+
+
+def _shown(radiance: Tensor) -> Tensor:
+    """Radiance to weigh errors by: a pixel clipped to black amid bright ones is taken for an eighth of them."""
+    around = F.avg_pool2d(radiance.permute(2, 0, 1), 3, 1, 1, count_include_pad=False).permute(1, 2, 0)
+    return torch.maximum(radiance, around / 8)
+
+
+def _estimate(
+    y: Pair, z: Pair, full: Tensor, weight: Tensor, gained: Tensor, improved: bool
+) -> tuple[Estimate, Tensor]:
+    """What the guard tells, and maps of the error before and after, (2, H, W).
+
+    The error of a denoised half is known without bias (Eq. 6): E‖z^a − y^b‖² is that error plus the variance of y^b.
+    It consists of variance, half of the spread V between the halves, and bias. The full buffer has half the variance.
+    Its bias is smaller too, unless the denoiser is linear; then the full buffer is the mean of the halves. How far it
+    is not tells by how much.
+    """
+    between = weight * ((y[0] - y[1]) ** 2).mean(-1)
+    crossed = weight * ((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2).mean(-1) / 2
+    spread = weight * ((z[0] - z[1]) ** 2).mean(-1)
+    nonlinear = weight * (((z[0] + z[1]) / 2 - full) ** 2).mean(-1)
+    v = float(spread.mean())
+    bias = max(float((crossed - between / 2).mean()) - v / 2, 0.0)
+    left = max(1 - _BIAS_SHRINKS * math.sqrt(float(nonlinear.mean()) / bias), 0.0) if bias > 0 else 0.0
+    half = max(bias + v / 2, float(gained.mean()))
+    denoised = left * bias + v / 4
     ratio = float(gained.mean()) / half if half > 0 else 0.0
+    before = left * (crossed - between / 2 - spread / 2) + spread / 4
+    after = before - gained * (denoised / half if half > 0 else 0.0)
     estimate = Estimate(
-        noisy=float(noise.mean()),
-        denoised=denoised_error,
-        corrected=denoised_error * (1 - ratio),
+        noisy=float(between.mean()) / 4,
+        denoised=denoised,
+        corrected=denoised * (1 - ratio),
         change=-ratio,
         standard_error=_tile_error(gained) / half if half > 0 else 0.0,
         improved=improved,
     )
-    before = error_of_half - spread / 4
-    dtype = denoised_full.dtype
-    errors = torch.stack([_smooth(before), _smooth(before - gained)]).clamp(0, torch.finfo(dtype).max)
-    return Guarded(image.to(dtype), alpha.to(dtype), estimate, errors.to(dtype))
+    return estimate, torch.stack([_smooth(before), _smooth(after)])
 
 
 def _pooled(n: Tensor, d: Tensor) -> Tensor:
@@ -177,25 +211,28 @@ def _smooth(image: Tensor) -> Tensor:
     return F.interpolate(means[None, None], size=image.shape, mode="bilinear")[0, 0]
 
 
-def _errors(y: Pair, z: Pair, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Relative squared error of a denoised half, spread between the denoised halves, noise of the mean of the halves.
+def trust_in_full(denoised: Pair, denoised_full: Tensor) -> Tensor:
+    """How far the full buffer's denoised image may stand in for the halves' own, (H, W, 1), 0 … 1.
 
-    Each is unbiased where it is averaged: E‖z^a − y^b‖² is the error of z^a plus the variance of y^b (Eq. 6). The full
-    buffer has half of a half's variance, so that a quarter of the spread has to come off; what its smaller bias brings
-    is not seen, and the estimate for the full buffer is an upper one.
+    It is the better input, but a firefly that the denoiser has left in one half is in the full buffer too; with their
+    own images only one of the corrected halves has it. So not where the halves differ by more than a factor of three,
+    unless the full buffer sides with the darker one.
     """
-    between = weight * ((y[0] - y[1]) ** 2).mean(-1)
-    crossed = weight * ((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2).mean(-1) / 2
-    spread = weight * ((z[0] - z[1]) ** 2).mean(-1)
-    return crossed - between / 2, spread, between / 4
+    a, b, full = (image.double().mean(-1) for image in (*denoised, denoised_full))
+    middle, half = (a + b) / 2, (a - b).abs() / 2
+    left_in_one = half > _DISAGREEMENT * middle.clamp(min=_DARKEST / 10)
+    sides_with_darker = (2 * (middle - full) / half.clamp(min=torch.finfo(torch.float64).tiny)).clamp(0, 1)
+    doubt = torch.where(left_in_one, 1 - sides_with_darker, 0.0)[None, None]
+    around = F.max_pool2d(doubt, 5, 1, 2)
+    return 1 - F.avg_pool2d(around, 5, 1, 2, count_include_pad=False)[0, 0][..., None]
 
 
 def keep_light(image: Tensor, denoised: Tensor, color: Pair) -> Tensor:
     """Bring the image's mean radiance to within three standard errors of the noisy mean.
 
     Corrections learned from a loss that has not seen every bright path lose light; the noisy mean has not. Small
-    losses are scaled away. For what two per cent of scaling do not reach, the image first goes towards the denoised
-    one, where that has kept more light: a scale knows nothing of where the light was lost, and enlarges all errors.
+    losses are scaled away. For what two per cent of scaling do not reach, light comes back from where the denoised
+    image has kept more of it, smoothed over 16 pixels, so that its fireflies stay away.
     """
     noisy = (color[0].double() + color[1].double()) / 2
     mean, target, kept = (float(x.double().mean()) for x in (image, noisy, denoised))
@@ -207,7 +244,8 @@ def keep_light(image: Tensor, denoised: Tensor, color: Pair) -> Tensor:
     if abs(kept - target) < abs(mean - target):
         reachable = min(max(mean, wanted / _LARGEST_SCALE), wanted * _LARGEST_SCALE)
         share = min(1.0, (reachable - mean) / (kept - mean))
-        result = result + share * (denoised.double() - result)
+        lost = (denoised.double() - result).unbind(-1)
+        result = (result + share * torch.stack([_smooth(channel) for channel in lost], -1)).clamp(min=0)
     scale = min(max(wanted / float(result.mean()), 1 / _LARGEST_SCALE), _LARGEST_SCALE)
     return (result * scale).to(image.dtype)
 

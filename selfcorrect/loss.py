@@ -38,6 +38,7 @@ def dual_buffer_loss(
     one_way = partial(
         cross_bilateral_loss,
         window=settings.window,
+        every=settings.taps_every,
         combination=settings.combination,
         threads=torch.get_num_threads(),
     )

@@ -47,6 +47,7 @@ class Settings:
         "eq10", "what the window's pixels are combined to", f"{_PAPER}, Table 1", choices=("eq10", "eq3")
     )
     window: int = _setting(19, "side of the cross-bilateral window, odd, at most 31", f"{_PAPER}, Sec. 4", least=1)
+    taps_every: int = _setting(1, "in training, take one in so many of the window's pixels", _OURS, least=1)
     filters: int = _setting(16, "filters of each hidden convolution", f"{_PAPER}, Sec. 4", least=1)
     layers: int = _setting(9, "3x3 convolutions", f"{_PAPER}, Sec. 4", least=2)
     patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1)
@@ -73,7 +74,10 @@ class Settings:
         choices=("glorot", "residual"),
     )
     inference: str = _setting(
-        "halves", "denoised image that the result is inferred with", f"{_PAPER}, Sec. 4", choices=("halves", "full")
+        "halves",
+        "denoised image that the result is inferred with: the halves', or the full buffer's where they agree",
+        f"{_PAPER}, Sec. 4",
+        choices=("halves", "full"),
     )
     guard: bool = _setting(False, "blend with the denoised image as far as the halves bear it out", _OURS)
     crossed_weights: bool = _setting(
@@ -108,6 +112,7 @@ class Settings:
                 input_scale=0.0,
                 log_radiance=True,
                 initialisation="residual",
+                inference="full",
                 guard=True,
                 crossed_weights=True,
             ),

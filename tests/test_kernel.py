@@ -61,17 +61,21 @@ def assert_close(name: str, got: Tensor, expected: Tensor, tolerance: float) -> 
     assert worst < tolerance, f"{name}: off by {worst:.2e} of the maximum"
 
 
-def compare(guides: Guides, raw: Tensor, corners: Tensor, window: int, combination: str, isa: str) -> None:
+def compare(
+    guides: Guides, raw: Tensor, corners: Tensor, window: int, combination: str, isa: str, every: int = 1
+) -> None:
     """Values and the gradient of every head, under a random upstream gradient."""
     values, gradients = TOLERANCE[torch.float32]
     expected_raw = raw.clone().requires_grad_()
-    expected = reference.cross_bilateral(guides, expected_raw, corners, window=window, combination=combination)
+    expected = reference.cross_bilateral(
+        guides, expected_raw, corners, window=window, every=every, combination=combination
+    )
     upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     (expected * upstream).sum().backward()
 
     got_raw = raw.float().requires_grad_()
     got = cpu.cross_bilateral(
-        single(guides), got_raw, corners, window=window, combination=combination, threads=2, isa=isa
+        single(guides), got_raw, corners, window=window, every=every, combination=combination, threads=2, isa=isa
     )
     (got * upstream.float()).sum().backward()
     assert_close("g", got, expected, values)
@@ -119,6 +123,30 @@ def test_reference_by_hand() -> None:
             g = g + beta[1] * (c["albedo"] - i["albedo"]) + beta[2] * (c["normal"] - i["normal"])
             total, weights = total + w * g, weights + w
     torch.testing.assert_close(got, total / weights)
+
+
+@pytest.mark.parametrize("every", [2, 3, 4, 5])
+def test_taken_taps_are_a_lattice_with_the_centre(every: int) -> None:
+    """What a pixel's output depends on: one tap in ``every``, in all rows."""
+    guides = make_guides(15, 15)
+    planes = guides.planes.clone().requires_grad_()
+    watched = Guides(**(vars(guides) | {"planes": planes}))
+    raw = make_raw(guides, "eq10", (1, 1, 1))
+    corners = torch.tensor([[7, 7]])
+    reference.cross_bilateral(watched, raw, corners, window=15, every=every).sum().backward()
+    m = guides.margin
+    taken = planes.grad[0, m : m + 15, m : m + 15] != 0
+    assert taken[7, 7]
+    assert taken.any(1).all()
+    assert abs(int(taken.sum()) - 225 / every) < 4
+
+
+@pytest.mark.parametrize("isa", VARIANTS)
+@pytest.mark.parametrize("every", [2, 3, 4, 5])
+def test_cpu_matches_reference_on_a_lattice(every: int, isa: str) -> None:
+    guides = make_guides(20, 19)
+    raw = make_raw(guides, "eq10", (2, 17, 18))
+    compare(guides, raw, torch.tensor([[-2, 1], [3, 0]]), 9, "eq10", isa, every)
 
 
 @pytest.mark.parametrize("taps", [1, 7])
@@ -170,7 +198,9 @@ def test_cpu_with_saturated_heads(scale: float, isa: str) -> None:
     corners = torch.zeros(1, 2, dtype=torch.int64)
     expected = reference.cross_bilateral(guides, raw, corners, window=9)
     got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral(single(guides), got_raw, corners, window=9, combination="eq10", threads=1, isa=isa)
+    got = cpu.cross_bilateral(
+        single(guides), got_raw, corners, window=9, every=1, combination="eq10", threads=1, isa=isa
+    )
     got.sum().backward()
     assert_close("g", got, expected, 1e-4)
     assert got_raw.grad.isfinite().all()
@@ -184,7 +214,9 @@ def test_cpu_with_extreme_radiance(isa: str) -> None:
     corners = torch.zeros(1, 2, dtype=torch.int64)
     expected = reference.cross_bilateral(guides, raw, corners, window=9)
     got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral(single(guides), got_raw, corners, window=9, combination="eq10", threads=1, isa=isa)
+    got = cpu.cross_bilateral(
+        single(guides), got_raw, corners, window=9, every=1, combination="eq10", threads=1, isa=isa
+    )
     assert_close("g", got, expected, 1e-4)
     got.sum().backward()
     assert got_raw.grad.isfinite().all()
@@ -209,6 +241,7 @@ def test_fused_loss_matches_reference(buffers: tuple[bool, bool, bool], isa: str
         other.radiance.float(),
         weight.float(),
         window=5,
+        every=1,
         combination="eq10",
         threads=2,
         isa=isa,

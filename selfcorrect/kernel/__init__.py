@@ -27,9 +27,11 @@ def _backend(planes: Tensor, backend: str | None) -> str:
     return "cpu" if planes.device.type == "cpu" and planes.dtype == torch.float32 else "reference"
 
 
-def _validate(guides: Guides, raw: Tensor, corners: Tensor, window: int, combination: str) -> None:
+def _validate(guides: Guides, raw: Tensor, corners: Tensor, window: int, every: int, combination: str) -> None:
     if window % 2 == 0 or not 1 <= window <= LARGEST_WINDOW:
         raise SettingsError(f"expected an odd window from 1 to {LARGEST_WINDOW}, but got {window}")
+    if every < 1:
+        raise SettingsError(f"expected one tap in 1 or more, but got one in {every}")
     if combination not in ("eq3", "eq10"):
         raise SettingsError(f"expected the combination eq3 or eq10, but got {combination}")
     heads = heads_count(guides, combination)
@@ -51,6 +53,7 @@ def cross_bilateral(
     corners: Tensor,
     *,
     window: int,
+    every: int = 1,
     combination: str = "eq10",
     threads: int = 1,
     backend: str | None = None,
@@ -62,6 +65,7 @@ def cross_bilateral(
         raw: network outputs before tanh and softplus, (N, heads, h, w), any strides.
         corners: image row and column of each patch's first pixel, (N, 2), int64; may lie outside the image.
         window: side of the window, odd, 1 … 31.
+        every: 1 takes all taps of the window; n > 1 a lattice of one in n, the centre's weight divided by n.
         combination: "eq10" or "eq3".
         threads: of the compiled kernel.
         backend: "cpu" or "reference"; by default what the device and dtype allow.
@@ -73,10 +77,14 @@ def cross_bilateral(
         FrameError: shapes do not fit, or a patch reaches beyond the margin.
         SettingsError: window or combination out of range.
     """
-    _validate(guides, raw, corners, window, combination)
+    _validate(guides, raw, corners, window, every, combination)
     if _backend(guides.planes, backend) == "cpu":
-        return cpu.cross_bilateral(guides, raw, corners, window=window, combination=combination, threads=threads)
-    return reference.cross_bilateral(guides, raw, corners, window=window, combination=combination, taps_per_step=1)
+        return cpu.cross_bilateral(
+            guides, raw, corners, window=window, every=every, combination=combination, threads=threads
+        )
+    return reference.cross_bilateral(
+        guides, raw, corners, window=window, every=every, combination=combination, taps_per_step=1
+    )
 
 
 def cross_bilateral_loss(
@@ -87,6 +95,7 @@ def cross_bilateral_loss(
     weight: Tensor,
     *,
     window: int,
+    every: int = 1,
     combination: str = "eq10",
     threads: int = 1,
     backend: str | None = None,
@@ -96,15 +105,15 @@ def cross_bilateral_loss(
     ``target`` (3, …) and ``weight`` (…) are padded like the guides' planes. The gradient at a pixel is known as
     soon as its output is, so that the compiled kernel visits each pixel once.
     """
-    _validate(guides, raw, corners, window, combination)
+    _validate(guides, raw, corners, window, every, combination)
     if _backend(guides.planes, backend) == "cpu":
         return cpu.cross_bilateral_loss(
-            guides, raw, corners, target, weight, window=window, combination=combination, threads=threads
+            guides, raw, corners, target, weight, window=window, every=every, combination=combination, threads=threads
         )
     size = (raw.shape[2], raw.shape[3])
     padded = torch.cat([target, weight[None]])
     rows = corners[:, 0, None] + guides.margin + torch.arange(size[0])
     columns = corners[:, 1, None] + guides.margin + torch.arange(size[1])
     cut = padded[:, rows[:, :, None], columns[:, None, :]].transpose(0, 1)
-    g = cross_bilateral(guides, raw, corners, window=window, combination=combination, backend=backend)
+    g = cross_bilateral(guides, raw, corners, window=window, every=every, combination=combination, backend=backend)
     return (0.5 * cut[:, 3:] * (g - cut[:, :3]) ** 2).mean()

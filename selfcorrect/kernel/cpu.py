@@ -1,6 +1,6 @@
 """The compiled kernel as differentiable torch functions."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,67 +16,81 @@ def instruction_sets() -> list[str]:
     return list(_cpu.instruction_sets())
 
 
-def _arguments(
-    guides: Guides, raw: Tensor, corners: Tensor, window: int, combination: str, isa: str, threads: int
-) -> tuple[Any, ...]:
+class _Options(NamedTuple):
+    window: int
+    every: int
+    combination: str
+    isa: str
+    threads: int
+
+
+def _arguments(guides: Guides, raw: Tensor, corners: Tensor, options: _Options) -> tuple[Any, ...]:
     return (
         guides.planes,
         raw.detach(),
         (corners + guides.margin).contiguous(),
-        window,
+        options.window,
+        options.every,
         guides.has_albedo,
         guides.has_normal,
         guides.has_visibility,
-        combination == "eq3",
-        isa,
-        threads,
+        options.combination == "eq3",
+        options.isa or instruction_sets()[-1],
+        options.threads,
     )
 
 
 class _CrossBilateral(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, raw: Tensor, guides: Guides, corners: Tensor, *options: Any) -> Tensor:
+    def forward(ctx: Any, raw: Tensor, guides: Guides, corners: Tensor, options: _Options) -> Tensor:
         ctx.save_for_backward(raw)
-        ctx.call = (guides, corners, *options)
+        ctx.call = (guides, corners, options)
         output = raw.new_empty((raw.shape[0], 3, raw.shape[2], raw.shape[3]))
-        _cpu.forward(*_arguments(guides, raw, corners, *options), output)
+        _cpu.forward(*_arguments(guides, raw, corners, options), output)
         return output
 
     @staticmethod
     def backward(ctx: Any, *output_gradients: Tensor) -> Any:
         (raw,) = ctx.saved_tensors
-        guides, corners, *options = ctx.call
+        guides, corners, options = ctx.call
         gradient = torch.empty_like(raw)
-        _cpu.backward(*_arguments(guides, raw, corners, *options), output_gradients[0].contiguous(), gradient)
-        return gradient, *[None] * (2 + len(options))
+        _cpu.backward(*_arguments(guides, raw, corners, options), output_gradients[0].contiguous(), gradient)
+        return gradient, None, None, None
 
 
 class _CrossBilateralLoss(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, raw: Tensor, guides: Guides, corners: Tensor, target: Tensor, weight: Tensor, *options: Any
+        ctx: Any, raw: Tensor, guides: Guides, corners: Tensor, target: Tensor, weight: Tensor, options: _Options
     ) -> Tensor:
         gradient = torch.empty_like(raw)
         row_loss = torch.empty(raw.shape[0] * raw.shape[2], dtype=torch.float64)
-        _cpu.loss(*_arguments(guides, raw, corners, *options), target, weight, gradient, row_loss)
+        _cpu.loss(*_arguments(guides, raw, corners, options), target, weight, gradient, row_loss)
         count = raw.shape[0] * raw.shape[2] * raw.shape[3] * 3
         ctx.save_for_backward(gradient)
         ctx.count = count
-        ctx.others = 4 + len(options)
         return (row_loss.sum() / count).to(raw.dtype)
 
     @staticmethod
     def backward(ctx: Any, *output_gradients: Tensor) -> Any:
         (gradient,) = ctx.saved_tensors
-        return gradient * (output_gradients[0] / ctx.count), *[None] * ctx.others
+        return gradient * (output_gradients[0] / ctx.count), None, None, None, None, None
 
 
 def cross_bilateral(
-    guides: Guides, raw: Tensor, corners: Tensor, *, window: int, combination: str, threads: int, isa: str = ""
+    guides: Guides,
+    raw: Tensor,
+    corners: Tensor,
+    *,
+    window: int,
+    every: int,
+    combination: str,
+    threads: int,
+    isa: str = "",
 ) -> Tensor:
     """Eq. 10, like :func:`selfcorrect.kernel.reference.cross_bilateral`, for float32 on the CPU."""
-    options = (window, combination, isa or instruction_sets()[-1], threads)
-    result: Tensor = _CrossBilateral.apply(raw, guides, corners, *options)  # type: ignore[no-untyped-call]  # torch's
+    options = _Options(window, every, combination, isa, threads)
+    result: Tensor = _CrossBilateral.apply(raw, guides, corners, options)  # type: ignore[no-untyped-call]  # torch's
     return result
 
 
@@ -88,13 +102,14 @@ def cross_bilateral_loss(
     weight: Tensor,
     *,
     window: int,
+    every: int,
     combination: str,
     threads: int,
     isa: str = "",
 ) -> Tensor:
     """One half of Eq. 8, value and gradient in one visit of each pixel."""
-    options = (window, combination, isa or instruction_sets()[-1], threads)
+    options = _Options(window, every, combination, isa, threads)
     result: Tensor = _CrossBilateralLoss.apply(  # type: ignore[no-untyped-call]  # torch's
-        raw, guides, corners, target, weight, *options
+        raw, guides, corners, target, weight, options
     )
     return result

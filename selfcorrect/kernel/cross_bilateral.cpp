@@ -94,14 +94,17 @@ public:
             inverse[m] = 1.0f / (gamma * gamma + epsilon);
             inverse_slope[m] = -2.0f * gamma * inverse[m] * inverse[m] * slope;
         }
-        centre_weight = softplus(head(betas + G::gammas), centre_slope) + centre_epsilon;
+        // Where only every n-th tap is taken, the centre counts for an n-th too.
+        const float share = 1.0f / job.every;
+        centre_weight = (softplus(head(betas + G::gammas), centre_slope) + centre_epsilon) * share;
+        centre_slope *= share;
     }
 
     // Sums over the window; keeps each tap's weight and logarithmic distances for the way back if Keep.
     template <bool Keep>
     void gather() {
         constexpr int m_albedo = 2, m_normal = m_albedo + Albedo, m_visibility = m_normal + Normal;
-        const int radius = job.window / 2;
+        const int radius = job.window / 2, every = job.every;
         const Float i_y = -inverse[0], i_z = -inverse[1];  // negative, so that each term is one FMA
         Float i_albedo = {}, i_normal = {}, i_visibility = {};
         if constexpr (Albedo) i_albedo = inverse[m_albedo] * -log2_e;
@@ -112,8 +115,9 @@ public:
         Three y_sum = {}, z_sum = {}, albedo_sum = {}, normal_sum = {};
         float* kept = scratch;
         for (int dy = -radius; dy <= radius; ++dy) {
-            const float* p = job.planes + offset + dy * job.row_stride - radius;
-            for (int dx = -radius; dx <= radius; ++dx, ++p) {
+            const int first = first_tap(dy, radius);
+            const float* p = job.planes + offset + dy * job.row_stride + first;
+            for (int dx = first; dx <= radius; dx += every, p += every) {
                 const Three d_y = y_c - load3(p + G::y * stride, stride), d_z = z_c - load3(p + G::z * stride, stride);
                 const Float log_y = log2_distance(d_y), log_z = log2_distance(d_z);
                 Float exponent = log_y * i_y + log_z * i_z;
@@ -194,11 +198,12 @@ public:
             if constexpr (Normal) by_normal.v[k] = gradient.v[k] * beta[G::beta_normal + k];
         }
         Float sum_y = {}, sum_z = {}, sum_albedo = {}, sum_normal = {}, sum_visibility = {};
-        const int radius = job.window / 2;
+        const int radius = job.window / 2, every = job.every;
         const float* kept = scratch;
         for (int dy = -radius; dy <= radius; ++dy) {
-            const float* p = job.planes + offset + dy * job.row_stride - radius;
-            for (int dx = -radius; dx <= radius; ++dx, ++p, kept += 3 * lanes) {
+            const int first = first_tap(dy, radius);
+            const float* p = job.planes + offset + dy * job.row_stride + first;
+            for (int dx = first; dx <= radius; dx += every, p += every, kept += 3 * lanes) {
                 const Three d_z = z_c - load3(p + G::z * stride, stride);
                 Float s = dot(by_z, d_z, dot(gradient, load3(p + G::y * stride, stride) - y_c, -s_centre));
                 Three d_albedo, d_normal;
@@ -238,6 +243,12 @@ public:
     }
 
 private:
+    // Taps with dx = slope dy (mod every) are taken: a lattice that has the centre and is spread over all rows.
+    int first_tap(int dy, int radius) const {
+        const int slope = job.every < 4 ? 1 : 2;
+        return -radius + (slope * dy + radius + job.every * job.window) % job.every;
+    }
+
     Float head(int k) const {
         const auto& s = job.head_strides;
         return load_strided(job.heads + patch * s[0] + k * s[1] + row * s[2] + x * s[3], s[3], n);

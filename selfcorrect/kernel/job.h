@@ -14,6 +14,7 @@ struct Job {
     bool has_albedo, has_normal, has_visibility;
     bool eq3;  // Eq. 3: beta^z = 1, no other beta; else Eq. 10
     int window;
+    int every;  // taps taken: all with 1, else those of a lattice, one in `every`
 
     // Raw network outputs and their gradient, (patches, heads, h, w) with any strides.
     const float* heads;

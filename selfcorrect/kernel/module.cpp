@@ -80,7 +80,7 @@ void run(const Job& job, Mode mode, const std::string& instruction_set, int thre
     for (auto& thread : pool) thread.join();
 }
 
-Job make_job(const Array& planes, const Array& heads, const Corners& corners, int window, bool albedo, bool normal,
+Job make_job(const Array& planes, const Array& heads, const Corners& corners, int window, int every, bool albedo, bool normal,
              bool visibility, bool eq3) {
     Job job{};
     job.planes = planes.data();
@@ -91,6 +91,7 @@ Job make_job(const Array& planes, const Array& heads, const Corners& corners, in
     job.has_visibility = visibility;
     job.eq3 = eq3;
     job.window = window;
+    job.every = every;
     job.heads = heads.data();
     for (int i = 0; i < 4; ++i) job.head_strides[i] = heads.stride(i);
     job.patches = int(heads.shape(0));
@@ -111,27 +112,27 @@ NB_MODULE(_cpu, m) {
     m.def("instruction_sets", &instruction_sets, "Names this processor can run, slowest first.");
 
     m.def("forward",
-          [](Array planes, Array heads, Corners corners, int window, bool albedo, bool normal, bool visibility,
+          [](Array planes, Array heads, Corners corners, int window, int every, bool albedo, bool normal, bool visibility,
              bool eq3, const std::string& instruction_set, int threads, Array output) {
-              Job job = make_job(planes, heads, corners, window, albedo, normal, visibility, eq3);
+              Job job = make_job(planes, heads, corners, window, every, albedo, normal, visibility, eq3);
               job.output = output.data();
               run(job, Mode::forward, instruction_set, threads);
           });
 
     m.def("backward",
-          [](Array planes, Array heads, Corners corners, int window, bool albedo, bool normal, bool visibility,
+          [](Array planes, Array heads, Corners corners, int window, int every, bool albedo, bool normal, bool visibility,
              bool eq3, const std::string& instruction_set, int threads, Array output_gradient, Array gradient) {
-              Job job = make_job(planes, heads, corners, window, albedo, normal, visibility, eq3);
+              Job job = make_job(planes, heads, corners, window, every, albedo, normal, visibility, eq3);
               job.output_gradient = output_gradient.data();
               set_gradient(job, gradient);
               run(job, Mode::backward, instruction_set, threads);
           });
 
     m.def("loss",
-          [](Array planes, Array heads, Corners corners, int window, bool albedo, bool normal, bool visibility,
+          [](Array planes, Array heads, Corners corners, int window, int every, bool albedo, bool normal, bool visibility,
              bool eq3, const std::string& instruction_set, int threads, Array target, Array weight, Array gradient,
              Sums row_loss) {
-              Job job = make_job(planes, heads, corners, window, albedo, normal, visibility, eq3);
+              Job job = make_job(planes, heads, corners, window, every, albedo, normal, visibility, eq3);
               job.target = target.data();
               job.weight = weight.data();
               job.row_loss = row_loss.data();

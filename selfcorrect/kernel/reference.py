@@ -114,9 +114,10 @@ def _combined(c: _Pixels, i: _Pixels, heads: Heads) -> Tensor:
     return h
 
 
-def _neighbours(window: int, taps_per_step: int) -> Iterator[list[tuple[int, int]]]:
-    radius = window // 2
-    taps = [(dy, dx) for dy in range(-radius, radius + 1) for dx in range(-radius, radius + 1) if dy or dx]
+def _neighbours(window: int, every: int, taps_per_step: int) -> Iterator[list[tuple[int, int]]]:
+    radius, slope = window // 2, 1 if every < 4 else 2
+    side = range(-radius, radius + 1)
+    taps = [(dy, dx) for dy in side for dx in side if (dy or dx) and (dx - slope * dy) % every == 0]
     for start in range(0, len(taps), taps_per_step):
         yield taps[start : start + taps_per_step]
 
@@ -127,6 +128,7 @@ def cross_bilateral(
     corners: Tensor,
     *,
     window: int,
+    every: int = 1,
     combination: str = "eq10",
     taps_per_step: int | None = None,
 ) -> Tensor:
@@ -137,6 +139,7 @@ def cross_bilateral(
         raw: network outputs before their activations, (N, heads, h, w).
         corners: image row and column of each patch's first pixel, (N, 2), int64.
         window: side of the window, odd.
+        every: 1 takes all taps; n > 1 a lattice of one in n, the centre's weight divided by n.
         combination: "eq10", or "eq3" for z_c + Σ w_i (y_i − z_i) / Σ w_i.
         taps_per_step: how many neighbours are gathered at a time. ``None`` gathers the whole window, which is
             the simplest form and needs window² times the memory; 1 is a loop over shifts. Fewer than all are
@@ -159,9 +162,9 @@ def cross_bilateral(
         w = _weight(c, i, heads)
         return w.sum(2), (w * _combined(c, i, heads)).sum(2)
 
-    w_sum = heads.tau + EPSILON  # w_c
+    w_sum = (heads.tau + EPSILON) / every  # w_c
     g_sum = w_sum * c.y[:, :, 0]
-    for taps in _neighbours(window, taps_per_step or window * window):
+    for taps in _neighbours(window, every, taps_per_step or window * window):
         if taps_per_step is None:
             w, wh = sums(taps, heads)
         else:
