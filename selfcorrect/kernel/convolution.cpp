@@ -116,7 +116,7 @@ void forward(const ConvolutionJob& job, const Task& task, char* scratch) {
             } else {
                 const Rows in = stage_rows(job, task.patch, stage - 1, width, memory, zeros);
                 const char* rows[3] = {in(y - 1), in(y), in(y + 1)};
-                convolve(rows, activation_bytes, stage == 1 ? job.inputs : filters,
+                convolve<true>(rows, stage == 1 ? job.inputs : filters,
                          job.packed + (stage - 1) * layer_floats, width, line);
             }
             if (stage < job.layers)
@@ -135,7 +135,6 @@ std::int64_t backward_scratch(const ConvolutionJob& job) {
 
 // Layer by layer; weights' and biases' gradients are added to the patch's own.
 void backward(const ConvolutionJob& job, int patch, char* scratch) {
-    const Setup setup;
     char* memory = aligned(scratch);
     char* zeros = make_zeros(memory, job.width);
     memory += zeros_size(job.width);
@@ -159,9 +158,10 @@ void backward(const ConvolutionJob& job, int patch, char* scratch) {
         weight_gradient(activation, upstream, layer == 0 ? job.inputs : filters, job.height, job.width,
                         gradients + layer * layer_floats, memory);
         if (layer == 0) return;
+        const Setup setup;
         for (int y = 0; y < job.height; ++y) {
             const char* rows[3] = {upstream(y - 1), upstream(y), upstream(y + 1)};
-            convolve(rows, gradient_bytes, layer == job.layers - 1 ? job.heads : filters,
+            convolve<false>(rows, layer == job.layers - 1 ? job.heads : filters,
                      job.packed + layer * layer_floats, job.width, line);
             keep_gradient(line, job.width, activation(y), downstream(y), bias(layer - 1));
         }

@@ -1,7 +1,7 @@
 // One row of a 3x3 convolution on matrix tiles (AMX): products of bf16, sums in single precision.
 //
 // Activations are rows [pixel][16] of bf16. Sixteen rows of a tile, 32 bytes apart, are sixteen pixels with the inputs
-// of two taps each. Gradients are rows of records of 64 bytes: the sixteen values of a pixel interleaved with those of
+// of two taps each; the third tap takes a tile half as wide. Gradients are rows of records of 64 bytes: the sixteen values of a pixel interleaved with those of
 // the next. A tile of consecutive records is again sixteen pixels with two taps each; a tile of every second record
 // is the right-hand operand of the sum over pixels that the weights' gradient is.
 #pragma once
@@ -23,20 +23,26 @@ constexpr int tile_pixels = 16, tile_bytes = 1024;
 // The compiler does not know that tiles are loaded from memory.
 inline void fence() { asm volatile("" ::: "memory"); }
 
-class Setup {
+// What the tiles are while rows are convolved: 0-3 sums, 4 and 6 two taps' pixels and weights, 5 and 7 one tap's.
+// While the weights' gradient is summed up: 0-5 sums, 6 activations, 7 gradients.
+template <bool correlating>
+class Tiles {
     struct alignas(64) Configuration {
         std::uint8_t palette = 1, start = 0, reserved[14] = {};
-        std::uint16_t row_bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
-        std::uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, 16};
+        std::uint16_t row_bytes[16] = {64, 64, 64, 64, 64, correlating ? 64 : 32, 64, 64};
+        std::uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, correlating ? 16 : 8};
     };
 
 public:
-    Setup() {
+    Tiles() {
         const Configuration all;
         _tile_loadconfig(&all);
     }
-    ~Setup() { _tile_release(); }
+    ~Tiles() { _tile_release(); }
+    Tiles(const Tiles&) = delete;
 };
+
+using Setup = Tiles<false>;
 
 // Pairs of 32-bit halves (a of one vector, b of the other) as bf16, a below b.
 inline __m512i interleaved(__m512 a, __m512 b) {
@@ -71,9 +77,10 @@ void pack(const float* weights, bool of_gradients, float* packed) {
     pack_tiles<true>(weights, packed);
 }
 
-// Tiles 0-3 sum, 4-5 are pixels, 6 is weights. Intrinsics take literal tile numbers only.
-template <bool four>
-void convolve_blocks(const char* const* rows, int pixel_bytes, const float* weights, int x, float* out) {
+// Intrinsics take literal tile numbers only. Gradients' records hold two taps, so their third one comes with nothing.
+template <bool four, bool by_pixel>
+void convolve_blocks(const char* const* rows, const float* weights, int x, float* out) {
+    constexpr int pixel = by_pixel ? activation_bytes : gradient_bytes, next = tile_pixels * pixel;
     const float* bias = weights + selfcorrect::layer_weights;
     const char* tiles = reinterpret_cast<const char*>(weights);
     _tile_loadd(0, bias, 0);
@@ -82,22 +89,46 @@ void convolve_blocks(const char* const* rows, int pixel_bytes, const float* weig
         _tile_loadd(2, bias, 0);
         _tile_loadd(3, bias, 0);
     }
-    for (int ky = 0; ky < 3; ++ky)
-        for (int tap = -1; tap <= 1; tap += 2, tiles += tile_bytes) {
-            const char* in = rows[ky] + std::int64_t(x + tap) * pixel_bytes;
-            const std::int64_t next = std::int64_t(tile_pixels) * pixel_bytes;
-            _tile_loadd(6, tiles, 64);
-            _tile_loadd(4, in, pixel_bytes);
+    for (int ky = 0; ky < 3; ++ky, tiles += 2 * tile_bytes) {
+        const char* in = rows[ky] + std::int64_t(x - 1) * pixel;
+        _tile_loadd(6, tiles, 64);
+        _tile_loadd(4, in, pixel);
+        _tile_dpbf16ps(0, 4, 6);
+        if (four) {
+            _tile_loadd(4, in + next, pixel);
+            _tile_dpbf16ps(1, 4, 6);
+            _tile_loadd(4, in + 2 * next, pixel);
+            _tile_dpbf16ps(2, 4, 6);
+            _tile_loadd(4, in + 3 * next, pixel);
+            _tile_dpbf16ps(3, 4, 6);
+        }
+        in += 2 * pixel;
+        if (by_pixel) {
+            _tile_loadd(7, tiles + tile_bytes, 64);
+            _tile_loadd(5, in, pixel);
+            _tile_dpbf16ps(0, 5, 7);
+            if (four) {
+                _tile_loadd(5, in + next, pixel);
+                _tile_dpbf16ps(1, 5, 7);
+                _tile_loadd(5, in + 2 * next, pixel);
+                _tile_dpbf16ps(2, 5, 7);
+                _tile_loadd(5, in + 3 * next, pixel);
+                _tile_dpbf16ps(3, 5, 7);
+            }
+        } else {
+            _tile_loadd(6, tiles + tile_bytes, 64);
+            _tile_loadd(4, in, pixel);
             _tile_dpbf16ps(0, 4, 6);
             if (four) {
-                _tile_loadd(5, in + next, pixel_bytes);
-                _tile_dpbf16ps(1, 5, 6);
-                _tile_loadd(4, in + 2 * next, pixel_bytes);
+                _tile_loadd(4, in + next, pixel);
+                _tile_dpbf16ps(1, 4, 6);
+                _tile_loadd(4, in + 2 * next, pixel);
                 _tile_dpbf16ps(2, 4, 6);
-                _tile_loadd(5, in + 3 * next, pixel_bytes);
-                _tile_dpbf16ps(3, 5, 6);
+                _tile_loadd(4, in + 3 * next, pixel);
+                _tile_dpbf16ps(3, 4, 6);
             }
         }
+    }
     _tile_stored(0, out, 64);
     if (four) {
         _tile_stored(1, out + tile_pixels * filters, 64);
@@ -106,12 +137,13 @@ void convolve_blocks(const char* const* rows, int pixel_bytes, const float* weig
     }
 }
 
-void convolve(const char* const* rows, int pixel_bytes, int, const float* weights, int width, float* out) {
+template <bool by_pixel>
+void convolve(const char* const* rows, int, const float* weights, int width, float* out) {
     fence();
     int x = 0;
     for (; x + 3 * tile_pixels < width; x += 4 * tile_pixels)
-        convolve_blocks<true>(rows, pixel_bytes, weights, x, out + x * filters);
-    for (; x < width; x += tile_pixels) convolve_blocks<false>(rows, pixel_bytes, weights, x, out + x * filters);
+        convolve_blocks<true, by_pixel>(rows, weights, x, out + x * filters);
+    for (; x < width; x += tile_pixels) convolve_blocks<false, by_pixel>(rows, weights, x, out + x * filters);
 }
 
 void clear(char* row, std::int64_t from, std::int64_t to, int bytes) {
@@ -166,8 +198,7 @@ inline void transpose_pixels(const char* from, char* to, std::int64_t pitch) {
     for (int c = 0; c < 16; ++c) _mm512_storeu_si512(to + c * pitch, _mm512_loadu_si512(planes + 16 * c));
 }
 
-// Sums over all pixels of activation x gradient, for the taps of two rows or one (tiles 0-5; 6 activations, 7
-// gradients).
+// Sums over all pixels of activation x gradient, for the taps of two rows or one.
 template <bool two, class Rows>
 void correlate(const char* planes, const Rows& upstream, int ky, int height, int width, float* gradient) {
     const std::int64_t pitch = 2 * padded(width);
@@ -221,6 +252,7 @@ void weight_gradient(const Rows& activation, const Rows& upstream, int, int heig
     for (int y = 0; y < height; ++y)
         for (int x = 0; x < width; x += 32)
             transpose_pixels(activation(y) + x * activation_bytes, scratch + y * filters * pitch + 2 * x, pitch);
+    const Tiles<true> tiles;
     correlate<true>(scratch, upstream, 0, height, width, gradient);
     correlate<false>(scratch, upstream, 2, height, width, gradient);
 }

@@ -41,7 +41,8 @@ inline void convolve_block(const char* const* rows, int inputs, const float* wei
     for (int p = 0; p < block; ++p) store(out + p * filters, sum[p]);
 }
 
-void convolve(const char* const* rows, int, int inputs, const float* weights, int width, float* out) {
+template <bool by_pixel>  // gradients lie as activations do
+void convolve(const char* const* rows, int inputs, const float* weights, int width, float* out) {
     for (int x = 0; x < width; x += block)
         for (int o = 0; o < filters; o += lanes) convolve_block(rows, inputs, weights + o, x, out + x * filters + o);
 }
