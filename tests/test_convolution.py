@@ -9,12 +9,11 @@ from selfcorrect.kernel import convolution
 from selfcorrect.kernel.convolution import convolutions
 from selfcorrect.network import Network
 
-# Largest difference to float64 over the largest value: (values, gradients). Worst measured here: 8e-7 and 2e-6.
+# Largest difference to float64 over the largest value: (values, gradients). Worst measured here: 7.7e-7 and 1.4e-6.
 SINGLE = (3e-6, 1e-5)
-# The same for bfloat16 against float64 with the same roundings. Single-precision sums may round to the neighbouring
-# bfloat16 where they lie on the edge, so that an activation is off by up to 2^-7 of itself, and all that follows by less.
-# By norm, for there are more such edges the more pixels there are; measured 9e-4 and 3e-3.
-ROUNDED = (2**-8, 2**-7)
+# The same for bfloat16, by norm, against float64 with the same roundings. Single-precision sums may round to the
+# neighbouring bfloat16 (2^-8) where they lie on the edge, which few do. Worst measured here: 1.6e-4 and 4.6e-4.
+ROUNDED = (2**-10, 2**-9)
 
 VARIANTS = convolution.instruction_sets()
 SIZES = [(1, 1), (1, 17), (16, 1), (5, 7), (19, 19), (3, 130), (33, 65), (64, 64)]
@@ -87,7 +86,8 @@ def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: tuple[flo
 
 
 def compare(network: Network, images: Tensor, isa: str) -> None:
-    upstream = random(images.shape[0], network.shape[-1][0], *images.shape[2:], seed=3) - 0.5
+    # of one sign, so that sums over pixels do not cancel and leave their rounding only
+    upstream = random(images.shape[0], network.shape[-1][0], *images.shape[2:], seed=3)
     exact = rounded_reference if isa == "amx" else reference
     tolerance = ROUNDED if isa == "amx" else SINGLE
     assert_close(compiled(network, images, upstream, isa), exact(network, images, upstream), tolerance)

@@ -1,9 +1,10 @@
 // All layers of the network on one patch, forward and backward. Compiled once per instruction set and precision;
 // SELFCORRECT_CONVOLUTION names the entry. As in cross_bilateral.cpp nothing here may leak into a baseline build.
 //
-// The way forward is a wavefront: each step brings one more row into every layer, each layer one row behind the one
-// before. So a layer's input need not outlive three rows unless it is kept for the way back. A pixel's sums are in
-// the same order wherever it lies: the result does not depend on how the image was cut.
+// The way forward is a wavefront: each step brings a few more rows into every layer, each layer one row behind the one
+// before. So a layer's input need not outlive them unless it is kept for the way back (then one step does all), and a
+// layer's weights, which do not all fit into the L1 cache at once, are fetched once for several rows. A pixel's sums
+// are in the same order wherever it lies: the result does not depend on how the image was cut.
 
 #if defined(SELFCORRECT_AMX)
 #include "convolution_amx.h"
@@ -21,8 +22,9 @@ using selfcorrect::layer_floats;
 using selfcorrect::row_pixels;
 using selfcorrect::Task;
 
-constexpr int ring = 3;   // rows of a layer's input that the wavefront needs at a time
-constexpr int group = 16; // pixels that are turned over at once
+constexpr int step_rows = 8;          // of the wavefront
+constexpr int ring = step_rows + 2;   // rows of a layer's input that it needs at a time
+constexpr int group = 16;             // pixels that are turned over at once
 
 inline int least(int a, int b) { return a < b ? a : b; }
 inline int most(int a, int b) { return a > b ? a : b; }
@@ -56,13 +58,21 @@ void logarithm(float* values) {
         store(values + i, log2_above_one(maximum(load(values + i) + 1.0f, splat(1.0f))) * 0.69314718f);
 }
 
+// Of known size, mostly: copies of any number of bytes take as long as all else.
+inline void copy(float* to, const float* from, int n) {
+    if (n == group)
+        std::memcpy(to, from, sizeof(float) * group);
+    else
+        for (int i = 0; i < n; ++i) to[i] = from[i];
+}
+
 // Row y of planes to a line of pixels.
 void read_row(const float* planes, std::int64_t plane_stride, int channels, bool log_radiance, int width, float* line) {
     for (int x = 0; x < width; x += group) {
         float values[filters * group] = {};
         const int n = least(group, width - x);
         for (int c = 0; c < channels; ++c) {
-            std::memcpy(values + c * group, planes + c * plane_stride + x, n * sizeof(float));
+            copy(values + c * group, planes + c * plane_stride + x, n);
             if (log_radiance && (c < 3 || c >= channels - 3)) logarithm(values + c * group);
         }
         transpose(values, line + x * filters);
@@ -75,7 +85,7 @@ void write_row(const float* line, int channels, int width, float* planes, std::i
         transpose(line + x * filters, values);
         const int n = least(group, width - x);
         for (int c = 0; c < channels; ++c)
-            std::memcpy(planes + c * plane_stride + x, values + c * group, n * sizeof(float));
+            copy(planes + c * plane_stride + x, values + c * group, n);
     }
 }
 
@@ -95,37 +105,61 @@ std::int64_t forward_scratch(const ConvolutionJob& job, int region_width) {
     return zeros_size(width) + line_size(width) + rings + 64;
 }
 
-void forward(const ConvolutionJob& job, const Task& task, char* scratch) {
-    const Setup setup;
-    const int first = most(0, task.left - job.layers), width = least(job.width, task.right + job.layers) - first;
-    char* memory = aligned(scratch);
-    char* zeros = make_zeros(memory, width);
-    memory += zeros_size(width);
-    float* line = reinterpret_cast<float*>(memory);
-    memory += line_size(width);
-    const Image& image = job.images[task.patch];
-    const std::int64_t out_width = job.right - job.left, out_plane = out_width * (job.bottom - job.top);
-    float* output = job.output + task.patch * job.heads * out_plane;
-    for (int step = task.top - job.layers; step < task.bottom + job.layers; ++step) {
-        for (int stage = 0; stage <= job.layers; ++stage) {
-            const int y = step - stage, reach = job.layers - stage;
-            if (y < most(0, task.top - reach) || y >= least(job.height, task.bottom + reach)) continue;
-            if (stage == 0) {
-                read_row(image.pixels + y * image.row_stride + first, image.plane_stride, job.inputs,
-                         job.log_radiance, width, line);
-            } else {
-                const Rows in = stage_rows(job, task.patch, stage - 1, width, memory, zeros);
-                const char* rows[3] = {in(y - 1), in(y), in(y + 1)};
-                convolve<true>(rows, stage == 1 ? job.inputs : filters,
-                         job.packed + (stage - 1) * layer_floats, width, line);
+// One task: where its rows are and how one more of them comes about.
+class Forward {
+public:
+    Forward(const ConvolutionJob& job, const Task& task, char* scratch) : job(job), task(task) {
+        first = most(0, task.left - job.layers);
+        width = least(job.width, task.right + job.layers) - first;
+        memory = aligned(scratch);
+        zeros = make_zeros(memory, width);
+        memory += zeros_size(width);
+        line = reinterpret_cast<float*>(memory);
+        memory += line_size(width);
+    }
+
+    void run() {
+        const int rows = job.kept ? job.height + 2 * job.layers : step_rows;
+        for (int step = task.top - job.layers; step < task.bottom + job.layers; step += rows)
+            for (int stage = 0; stage <= job.layers; ++stage) {
+                const int reach = job.layers - stage;  // rows around the task that later layers see
+                const int begin = most(step - stage, most(0, task.top - reach));
+                const int end = least(step - stage + rows, least(job.height, task.bottom + reach));
+                for (int y = begin; y < end; ++y) make_row(stage, y);
             }
-            if (stage < job.layers)
-                keep_activation(line, width, stage > 0, stage_rows(job, task.patch, stage, width, memory, zeros)(y));
-            else
-                write_row(line + (task.left - first) * filters, job.heads, task.right - task.left,
-                          output + (y - job.top) * out_width + task.left - job.left, out_plane);
+    }
+
+private:
+    void make_row(int stage, int y) {
+        if (stage == 0) {
+            const Image& image = job.images[task.patch];
+            read_row(image.pixels + y * image.row_stride + first, image.plane_stride, job.inputs, job.log_radiance,
+                     width, line);
+        } else {
+            const Rows in = stage_rows(job, task.patch, stage - 1, width, memory, zeros);
+            const char* rows[3] = {in(y - 1), in(y), in(y + 1)};
+            convolve<true>(rows, stage == 1 ? job.inputs : filters, job.packed + (stage - 1) * layer_floats, width,
+                           line);
+        }
+        if (stage < job.layers) {
+            keep_activation(line, width, stage > 0, stage_rows(job, task.patch, stage, width, memory, zeros)(y));
+        } else {
+            const std::int64_t row = job.right - job.left, plane = row * (job.bottom - job.top);
+            write_row(line + (task.left - first) * filters, job.heads, task.right - task.left,
+                      job.output + task.patch * job.heads * plane + (y - job.top) * row + task.left - job.left, plane);
         }
     }
+
+    const ConvolutionJob& job;
+    const Task& task;
+    int first, width;  // columns that the task's depend on
+    char *memory, *zeros;
+    float* line;
+};
+
+void forward(const ConvolutionJob& job, const Task& task, char* scratch) {
+    const Setup setup;
+    Forward(job, task, scratch).run();
 }
 
 std::int64_t backward_scratch(const ConvolutionJob& job) {

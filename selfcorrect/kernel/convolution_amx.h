@@ -20,7 +20,7 @@ using selfcorrect::filters;
 constexpr int activation_bytes = 2 * filters, gradient_bytes = 4 * filters;
 constexpr int tile_pixels = 16, tile_bytes = 1024;
 
-// The compiler does not know that tiles are loaded from memory.
+// The compiler does not know that tiles and their configuration are loaded from memory.
 inline void fence() { asm volatile("" ::: "memory"); }
 
 // What the tiles are while rows are convolved: 0-3 sums, 4 and 6 two taps' pixels and weights, 5 and 7 one tap's.
@@ -36,6 +36,7 @@ class Tiles {
 public:
     Tiles() {
         const Configuration all;
+        asm volatile("" ::"r"(&all) : "memory");
         _tile_loadconfig(&all);
     }
     ~Tiles() { _tile_release(); }
