@@ -166,7 +166,7 @@ def _infer(network: Network, half: Half, shown: Tensor | None, settings: Setting
     """The corrected half, (H, W, 3), on the whole image at once."""
     guides = _guides(half, settings.window // 2, shown)
     origin = torch.zeros(1, 2, dtype=torch.int64)
-    raw = network(guides.patches(origin, (guides.height, guides.width)))
+    raw = network(guides.views(origin, (guides.height, guides.width)))
     g = cross_bilateral(
         guides,
         raw,

@@ -1,12 +1,13 @@
 """The network of Back et al. 2022: nine 3×3 convolutions, 20,303 parameters with all thirteen inputs."""
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
-from selfcorrect.kernel import Guides, heads_count
+from selfcorrect.kernel import Guides, convolution, heads_count
 from selfcorrect.settings import Settings
 
 __all__ = ["Network"]
@@ -25,7 +26,7 @@ class Network(nn.Module):
     Args:
         inputs: channels of the guides, radiance first and denoised radiance last.
         heads: raw outputs per pixel, see :func:`selfcorrect.kernel.heads_count`.
-        settings: ``filters``, ``layers``, ``log_radiance``.
+        settings: ``filters``, ``layers``, ``log_radiance``, ``precision``.
         generator: source of the first weights.
     """
 
@@ -33,13 +34,14 @@ class Network(nn.Module):
         super().__init__()
         widths = [inputs, *[settings.filters] * (settings.layers - 1), heads]
         self.log_radiance = settings.log_radiance
+        self.precision = settings.precision
         self.convolutions = nn.ModuleList()
         for i, o in pairwise(widths):
             # skip_init: torch's own first weights would draw from the caller's random numbers
-            convolution = nn.utils.skip_init(nn.Conv2d, i, o, 3, padding=1)
-            nn.init.xavier_uniform_(convolution.weight, generator=generator)
-            nn.init.zeros_(convolution.bias)
-            self.convolutions.append(convolution)
+            layer = nn.utils.skip_init(nn.Conv2d, i, o, 3, padding=1)
+            nn.init.xavier_uniform_(layer.weight, generator=generator)
+            nn.init.zeros_(layer.bias)
+            self.convolutions.append(layer)
 
     @classmethod
     def for_guides(cls, guides: Guides, settings: Settings, generator: torch.Generator) -> "Network":
@@ -49,7 +51,6 @@ class Network(nn.Module):
         if settings.initialisation == "residual":
             network._start_at_residual(guides, settings.combination)
         network.to(guides.planes.device)
-        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # lacking in torch's stubs
         return network
 
     def _start_at_residual(self, guides: Guides, combination: str) -> None:
@@ -68,14 +69,29 @@ class Network(nn.Module):
         """Shapes of all weights: two networks with the same shape can be exchanged."""
         return [tuple(p.shape) for p in self.parameters()]
 
-    def forward(self, guides: Tensor) -> Tensor:
-        """Guides (N, C, h, w) to raw heads (N, heads, h, w)."""
+    def forward(self, guides: Tensor | Sequence[Tensor]) -> Tensor:
+        """Guides, N of (C, h, w), to raw heads (N, heads, h, w); on the CPU as the compiled kernel computes them."""
+        parameters = list(self.parameters())
+        if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*guides, *parameters)) and (
+            max(p.shape[0] for p in (guides[0], *parameters)) <= convolution.LARGEST_WIDTH
+        ):
+            return convolution.convolutions(
+                list(guides),
+                parameters,
+                log_radiance=self.log_radiance,
+                precision=self.precision,
+                threads=torch.get_num_threads(),
+            )
+        return self.reference(guides if isinstance(guides, Tensor) else torch.stack(list(guides)))
+
+    def reference(self, guides: Tensor) -> Tensor:
+        """The same in plain torch: guides (N, C, h, w), any device and dtype."""
         x = guides
         if self.log_radiance:
             x = torch.cat([x[:, :3].log1p(), x[:, 3:-3], x[:, -3:].log1p()], 1)
         x = x.contiguous(memory_format=torch.channels_last)
         *hidden, last = self.convolutions
-        for convolution in hidden:
-            x = torch.relu_(convolution(x))
+        for layer in hidden:
+            x = torch.relu_(layer(x))
         raw: Tensor = last(x)
         return raw

@@ -50,6 +50,12 @@ class Settings:
     taps_every: int = _setting(1, "in training, take one in so many of the window's pixels", _OURS, least=1)
     filters: int = _setting(16, "filters of each hidden convolution", f"{_PAPER}, Sec. 4", least=1)
     layers: int = _setting(9, "3x3 convolutions", f"{_PAPER}, Sec. 4", least=2)
+    precision: str = _setting(
+        "fp32",
+        "of the convolutions: fp32, or bf16 where the processor has matrix tiles",
+        f"{_PAPER}, published code",
+        choices=("fp32", "bf16"),
+    )
     patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1)
     stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)

@@ -34,12 +34,12 @@ def train(
     if settings.crossed_weights:  # a weight that knows the witness rewards darkening
         a, b = b, a
     size = (settings.patch, settings.patch)
-    optimiser = torch.optim.Adam(network.parameters(), eps=settings.adam_epsilon)
+    optimiser = torch.optim.Adam(network.parameters(), eps=settings.adam_epsilon, fused=True)
     rate = learning_rate(guides, settings)
     steps = steps_count((guides[0].height, guides[0].width), settings)
     losses: list[float] = []
     for corners in batches((guides[0].height, guides[0].width), settings, generator):
-        batch = torch.cat([half.patches(corners, size) for half in guides])
+        batch = [patch for half in guides for patch in half.views(corners, size)]
         loss = dual_buffer_loss(network(batch), corners, guides, (a, b), settings)
         optimiser.zero_grad()
         loss.backward()

@@ -85,8 +85,11 @@ class Guides:
         """The planes of z, (3, …)."""
         return self.planes[-3:]
 
+    def views(self, corners: Tensor, size: tuple[int, int]) -> list[Tensor]:
+        """N patches (C, h, w), nothing copied; ``corners`` (N, 2) are the rows and columns of their first pixels."""
+        h, w = size
+        return [self.planes[:, y : y + h, x : x + w] for y, x in (corners + self.margin).tolist()]
+
     def patches(self, corners: Tensor, size: tuple[int, int]) -> Tensor:
-        """Cut (N, C, h, w) patches; ``corners`` (N, 2) are the rows and columns of their first pixels."""
-        rows = (corners[:, 0, None] + self.margin + torch.arange(size[0])).to(self.planes.device)
-        columns = (corners[:, 1, None] + self.margin + torch.arange(size[1])).to(self.planes.device)
-        return self.planes[:, rows[:, :, None], columns[:, None, :]].transpose(0, 1)
+        """The same patches, copied to (N, C, h, w)."""
+        return torch.stack(self.views(corners, size))

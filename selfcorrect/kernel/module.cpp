@@ -7,16 +7,13 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
-#include <atomic>
 #include <stdexcept>
 #include <string>
-#include <thread>
 #include <vector>
 
+#include "convolution_module.h"
 #include "job.h"
-#if defined(SELFCORRECT_X86)
-#include <xmmintrin.h>
-#endif
+#include "processor.h"
 
 namespace nb = nanobind;
 using nb::ndarray;
@@ -29,17 +26,6 @@ using Corners = ndarray<std::int64_t, nb::device::cpu, nb::c_contig>;
 using Sums = ndarray<double, nb::device::cpu, nb::c_contig>;
 
 namespace {
-
-// Denormal weights contribute nothing and cost a hundred cycles each.
-class FlushDenormals {
-#if defined(SELFCORRECT_X86)
-    unsigned saved = _mm_getcsr();
-
-public:
-    FlushDenormals() { _mm_setcsr(saved | 0x8040); }
-    ~FlushDenormals() { _mm_setcsr(saved); }
-#endif
-};
 
 std::vector<std::string> instruction_sets() {
     std::vector<std::string> names{"baseline"};
@@ -66,18 +52,12 @@ RowFunction row_function(const std::string& name) {
 void run(const Job& job, Mode mode, const std::string& instruction_set, int threads) {
     const RowFunction row = row_function(instruction_set);
     const std::int64_t rows = std::int64_t(job.patches) * job.height;
-    std::atomic<std::int64_t> next{0};
-    const auto work = [&] {
-        const FlushDenormals flush;
-        std::vector<float> scratch(selfcorrect::scratch_size(job.window));
-        for (std::int64_t i = next++; i < rows; i = next++) row(job, mode, i, scratch.data());
-    };
+    const std::int64_t workers = std::min<std::int64_t>(threads, rows);
     nb::gil_scoped_release release;
-    const int extra = int(std::min<std::int64_t>(threads, rows)) - 1;
-    std::vector<std::thread> pool;
-    for (int i = 0; i < extra; ++i) pool.emplace_back(work);
-    work();
-    for (auto& thread : pool) thread.join();
+    std::vector<float> scratch(workers * selfcorrect::scratch_size(job.window));
+    selfcorrect::spread(rows, threads, [&](std::int64_t i, int worker) {
+        row(job, mode, i, scratch.data() + worker * selfcorrect::scratch_size(job.window));
+    });
 }
 
 Job make_job(const Array& planes, const Array& heads, const Corners& corners, int window, int every, bool albedo, bool normal,
@@ -109,6 +89,8 @@ void set_gradient(Job& job, const Array& gradient) {
 }  // namespace
 
 NB_MODULE(_cpu, m) {
+    bind_convolution(m);
+
     m.def("instruction_sets", &instruction_sets, "Names this processor can run, slowest first.");
 
     m.def("forward",

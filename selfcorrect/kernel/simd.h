@@ -20,7 +20,7 @@ constexpr int lanes = SELFCORRECT_LANES;
 typedef float Float __attribute__((vector_size(4 * lanes)));
 typedef std::int32_t Int __attribute__((vector_size(4 * lanes)));
 
-inline Float splat(float x) { return Float{} + x; }
+inline Float splat(float x) { return x - Float{}; }  // minus zero is a broadcast, plus zero an addition
 
 inline Float load(const float* p) {
     Float x;
