@@ -138,10 +138,17 @@ def test_memory_layouts(isa: str) -> None:
     expected = compiled(network, view.contiguous()[None], upstream, isa)
     turned = view.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     last = upstream.contiguous(memory_format=torch.channels_last)
-    for image, gradient in ((view, upstream), (turned, upstream), (view, last), (view, upstream[:, :1].expand(1, 6, 21, 31))):
+    for image, gradient in (
+        (view, upstream),
+        (turned, upstream),
+        (view, last),
+        (view, upstream[:, :1].expand(1, 6, 21, 31)),
+    ):
         got = compiled(network, image[None], gradient, isa)
-        wanted = expected if gradient is upstream or gradient is last else compiled(
-            network, view[None].contiguous(), gradient.contiguous(), isa
+        wanted = (
+            expected
+            if gradient is upstream or gradient is last
+            else compiled(network, view[None].contiguous(), gradient.contiguous(), isa)
         )
         assert all(torch.equal(a, b) for a, b in zip(got, wanted, strict=True))
 

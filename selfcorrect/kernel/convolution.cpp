@@ -210,7 +210,7 @@ void backward(const ConvolutionJob& job, int patch, char* scratch) {
 namespace selfcorrect {
 
 Convolution SELFCORRECT_CONVOLUTION() {
-    return {activation_bytes, pack, forward_scratch, backward_scratch, forward, backward};
+    return {activation_bytes, pack, forward_scratch, backward_scratch, forward, backward, peak};
 }
 
 }  // namespace selfcorrect

@@ -50,6 +50,8 @@ struct Convolution {
     std::int64_t (*backward_scratch)(const ConvolutionJob&);
     void (*forward)(const ConvolutionJob&, const Task&, char* scratch);
     void (*backward)(const ConvolutionJob&, int patch, char* scratch);
+    // As many multiply-adds as the processor can do, for scripts/bench_convolution.py; returns how many.
+    double (*peak)(std::int64_t rounds);
 };
 
 Convolution convolution_amx();

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from selfcorrect.kernel import _cpu
 
-__all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "instruction_sets"]
+__all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "instruction_sets", "peak"]
 
 LARGEST_WIDTH = 16  # channels of a layer: a vector of the widest processors
 
@@ -24,53 +24,38 @@ def best_instruction_set(precision: str) -> str:
     return names[-1] if precision == "bf16" else [name for name in names if name != "amx"][-1]
 
 
+def peak(isa: str, rounds: int) -> float:
+    """Do nothing but multiply-adds on one thread, as fast as this variant can; returns how many they were."""
+    return _cpu.convolution_peak(isa, rounds)
+
+
 class _Convolutions(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        images: list[Tensor],
-        train: bool,
-        log_radiance: bool,
-        region: list[int],
-        threads: int,
-        isa: str,
-        *parameters: Tensor,
-    ) -> Tensor:
-        weights, biases = list(parameters[::2]), list(parameters[1::2])
+    def forward(ctx: Any, images: list[Tensor], region: list[int], train: bool, *options: Any) -> Tensor:
+        log_radiance, threads, isa, *parameters = options
+        widths = [images[0].shape[0], *(bias.shape[0] for bias in parameters[1::2])]
+        flat = torch.cat([p.detach().reshape(-1) for p in parameters])  # each tensor handed over costs microseconds
         _, height, width = images[0].shape
         top, left, bottom, right = region
-        shape = (len(images), len(weights), height, width)
-        kept = torch.empty(_cpu.convolution_kept_bytes(isa, *shape) if train else 0, dtype=torch.uint8)
-        output = torch.empty(len(images), weights[-1].shape[0], bottom - top, right - left)
-        _cpu.convolution_forward(
-            images,
-            [w.detach() for w in weights],
-            [b.detach() for b in biases],
-            log_radiance,
-            region,
-            isa,
-            threads,
-            kept,
-            output,
-        )
-        ctx.save_for_backward(kept, *weights)
-        ctx.options = (isa, threads)
+        size = _cpu.convolution_kept_bytes(isa, len(images), len(widths) - 1, height, width) if train else 0
+        kept = torch.empty(size, dtype=torch.uint8)
+        output = torch.empty(len(images), widths[-1], bottom - top, right - left)
+        _cpu.convolution_forward(images, flat, widths, log_radiance, region, isa, threads, kept, output)
+        ctx.save_for_backward(kept, flat)
+        ctx.options = (widths, isa, threads)
+        ctx.shapes = [p.shape for p in parameters]
         return output
 
     @staticmethod
     def backward(ctx: Any, *output_gradients: Tensor) -> Any:
-        kept, *weights = ctx.saved_tensors
-        isa, threads = ctx.options
+        kept, flat = ctx.saved_tensors
         (upstream,) = output_gradients
         if upstream.stride(3) != 1:
             upstream = upstream.contiguous()
-        weight_gradients = [torch.empty(w.shape) for w in weights]
-        bias_gradients = [torch.empty(w.shape[0]) for w in weights]
-        _cpu.convolution_backward(
-            [w.detach() for w in weights], isa, threads, kept, upstream, weight_gradients, bias_gradients
-        )
-        pairs = zip(weight_gradients, bias_gradients, strict=True)
-        return *[None] * 6, *[gradient for pair in pairs for gradient in pair]
+        gradient = torch.empty_like(flat)
+        _cpu.convolution_backward(flat, *ctx.options, kept, upstream, gradient)
+        pieces = gradient.split([shape.numel() for shape in ctx.shapes])
+        return *[None] * 6, *(piece.view(shape) for piece, shape in zip(pieces, ctx.shapes, strict=True))
 
 
 def convolutions(
@@ -102,9 +87,14 @@ def convolutions(
     """
     _, height, width = images[0].shape
     views = [image if image.stride(2) == 1 else image.contiguous() for image in images]
-    where = list(region or (0, 0, height, width))
-    isa = isa or best_instruction_set(precision)
     train = torch.is_grad_enabled() and any(p.requires_grad for p in parameters)
-    options = (train, log_radiance, where, threads, isa)
-    result: Tensor = _Convolutions.apply(views, *options, *parameters)  # type: ignore[no-untyped-call]  # torch's
+    result: Tensor = _Convolutions.apply(  # type: ignore[no-untyped-call]  # torch's
+        views,
+        list(region or (0, 0, height, width)),
+        train,
+        log_radiance,
+        threads,
+        isa or best_instruction_set(precision),
+        *parameters,
+    )
     return result

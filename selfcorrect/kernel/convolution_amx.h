@@ -246,6 +246,23 @@ void correlate(const char* planes, const Rows& upstream, int ky, int height, int
     }
 }
 
+double peak(std::int64_t rounds) {
+    const Setup setup;
+    _tile_zero(0);
+    _tile_zero(1);
+    _tile_zero(2);
+    _tile_zero(3);
+    _tile_zero(4);
+    _tile_zero(6);
+    for (std::int64_t i = 0; i < rounds; ++i) {
+        _tile_dpbf16ps(0, 4, 6);
+        _tile_dpbf16ps(1, 4, 6);
+        _tile_dpbf16ps(2, 4, 6);
+        _tile_dpbf16ps(3, 4, 6);
+    }
+    return double(rounds) * 4 * tile_pixels * filters * 2 * filters;
+}
+
 template <class Rows>
 void weight_gradient(const Rows& activation, const Rows& upstream, int, int height, int width, float* gradient,
                      char* scratch) {

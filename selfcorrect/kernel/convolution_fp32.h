@@ -101,6 +101,20 @@ inline void correlate(const float* in, const float* upstream, int width, float* 
 
 constexpr std::int64_t weight_scratch(int, int) { return 0; }
 
+double peak(std::int64_t rounds) {
+    constexpr int sums = 12;
+    Float sum[sums];
+    for (int k = 0; k < sums; ++k) sum[k] = splat(float(k));  // all different, or the compiler would do one only
+    const Float factor = splat(0.5f);
+    for (std::int64_t i = 0; i < rounds; ++i) {
+#pragma GCC unroll 12
+        for (int k = 0; k < sums; ++k) sum[k] = sum[k] * factor + factor;
+    }
+    volatile Float kept;
+    for (int k = 0; k < sums; ++k) kept = sum[k];
+    return double(rounds) * sums * lanes;
+}
+
 template <class Rows>
 void weight_gradient(const Rows& activation, const Rows& upstream, int inputs, int height, int width, float* gradient,
                      char*) {

@@ -71,38 +71,38 @@ Convolution variant(const std::string& name) {
     return convolution_baseline();
 }
 
-// (out, in, 3, 3) to [ky][kx][in][16] with the biases behind, or turned round for the way back.
-void lay_out(const Array& weight, const Array* bias, bool turned, float* to) {
-    std::fill(to, to + layer_floats, 0.0f);
-    const float* from = weight.data();
-    for (std::size_t o = 0; o < weight.shape(0); ++o)
-        for (std::size_t i = 0; i < weight.shape(1); ++i)
-            for (std::size_t ky = 0; ky < 3; ++ky)
-                for (std::size_t kx = 0; kx < 3; ++kx) {
-                    const float value = from[o * weight.stride(0) + i * weight.stride(1) + ky * weight.stride(2) +
-                                             kx * weight.stride(3)];
-                    const std::size_t tap = turned ? 8 - (ky * 3 + kx) : ky * 3 + kx;
-                    to[(tap * filters + (turned ? o : i)) * filters + (turned ? i : o)] = value;
-                }
-    if (bias)
-        for (std::size_t o = 0; o < bias->shape(0); ++o) to[layer_weights + o] = bias->data()[o * bias->stride(0)];
+// Where the weights and biases of a layer of `ins` inputs and `outs` outputs are in torch's (out, in, 3, 3) and in ours.
+template <class Pair>
+void each_weight(int ins, int outs, bool turned, const Pair& pair) {
+    int theirs = 0;
+    for (int o = 0; o < outs; ++o)
+        for (int i = 0; i < ins; ++i)
+            for (int tap = 0; tap < 9; ++tap, ++theirs)
+                pair(theirs, turned ? ((8 - tap) * filters + o) * filters + i : (tap * filters + i) * filters + o);
+    if (turned) return;
+    for (int o = 0; o < outs; ++o, ++theirs) pair(theirs, layer_weights + o);
 }
 
+std::int64_t parameters(int ins, int outs) { return (9 * ins + 1) * outs; }
+
+// A job with all layers' weights packed, for the way forward or turned round for the way back. `flat` holds weight and
+// bias of each layer in turn; `widths` the channels before, between and after the layers.
 struct Network {
     std::vector<float> packed;
     ConvolutionJob job{};
 
-    Network(const Convolution& way, const std::vector<Array>& weights, const std::vector<Array>* biases) {
-        packed.resize(weights.size() * layer_floats);
-        float laid[layer_floats];
-        for (std::size_t layer = 0; layer < weights.size(); ++layer) {
-            lay_out(weights[layer], biases ? &(*biases)[layer] : nullptr, !biases, laid);
-            way.pack(laid, !biases, packed.data() + layer * layer_floats);
-        }
-        job.layers = int(weights.size());
-        job.inputs = int(weights.front().shape(1));
-        job.heads = int(weights.back().shape(0));
+    Network(const Convolution& way, const float* flat, const std::vector<int>& widths, bool turned) {
+        job.layers = int(widths.size()) - 1;
+        job.inputs = widths.front();
+        job.heads = widths.back();
+        packed.resize(std::size_t(job.layers) * layer_floats);
         job.packed = packed.data();
+        for (int layer = 0; layer < job.layers; ++layer) {
+            float laid[layer_floats] = {};
+            each_weight(widths[layer], widths[layer + 1], turned, [&](int theirs, int ours) { laid[ours] = flat[theirs]; });
+            way.pack(laid, turned, packed.data() + layer * layer_floats);
+            flat += parameters(widths[layer], widths[layer + 1]);
+        }
     }
 };
 
@@ -127,11 +127,10 @@ public:
     char* operator[](int worker) const { return memory.get() + worker * each; }
 };
 
-void forward(const std::vector<Array>& images, const std::vector<Array>& weights, const std::vector<Array>& biases,
-             bool log_radiance, std::vector<int> region, const std::string& instruction_set, int threads, Bytes kept,
-             Array output) {
+void forward(const std::vector<Array>& images, Array flat, const std::vector<int>& widths, bool log_radiance,
+             const std::vector<int>& region, const std::string& instruction_set, int threads, Bytes kept, Array output) {
     const Convolution way = variant(instruction_set);
-    Network network(way, weights, &biases);
+    Network network(way, flat.data(), widths, false);
     ConvolutionJob& job = network.job;
     std::vector<Image> views;
     for (const Array& image : images) views.push_back({image.data(), image.stride(0), image.stride(1)});
@@ -150,27 +149,23 @@ void forward(const std::vector<Array>& images, const std::vector<Array>& weights
     spread(count, threads, [&](std::int64_t i, int worker) { way.forward(job, all[i], scratch[worker]); });
 }
 
-// Adds up the patches' gradients in their order, back in torch's layout: contiguous (out, in, 3, 3) and (out).
-void collect(const ConvolutionJob& job, int patches, const std::vector<Array>& weights, std::vector<Array>& biases) {
+// Adds up the patches' gradients, in their order, to one laid out as the parameters are.
+void collect(const ConvolutionJob& job, int patches, const std::vector<int>& widths, float* flat) {
     for (int layer = 0; layer < job.layers; ++layer) {
         float sum[layer_floats] = {};
         for (int patch = 0; patch < patches; ++patch) {
             const float* from = job.gradients + (std::int64_t(patch) * job.layers + layer) * layer_floats;
             for (int i = 0; i < layer_floats; ++i) sum[i] += from[i];
         }
-        float* to = weights[layer].data();
-        const int outs = int(weights[layer].shape(0)), ins = int(weights[layer].shape(1));
-        for (int o = 0; o < outs; ++o)
-            for (int i = 0; i < ins; ++i)
-                for (int tap = 0; tap < 9; ++tap) *to++ = sum[(tap * filters + i) * filters + o];
-        std::copy(sum + layer_weights, sum + layer_weights + outs, biases[layer].data());
+        each_weight(widths[layer], widths[layer + 1], false, [&](int theirs, int ours) { flat[theirs] = sum[ours]; });
+        flat += parameters(widths[layer], widths[layer + 1]);
     }
 }
 
-void backward(const std::vector<Array>& weights, const std::string& instruction_set, int threads, Bytes kept,
-              Array upstream, std::vector<Array> weight_gradients, std::vector<Array> bias_gradients) {
+void backward(Array flat, const std::vector<int>& widths, const std::string& instruction_set, int threads, Bytes kept,
+              Array upstream, Array gradient) {
     const Convolution way = variant(instruction_set);
-    Network network(way, weights, nullptr);
+    Network network(way, flat.data(), widths, true);
     ConvolutionJob& job = network.job;
     const int patches = int(upstream.shape(0));
     job.height = int(upstream.shape(2));
@@ -183,7 +178,7 @@ void backward(const std::vector<Array>& weights, const std::string& instruction_
     job.gradients = gradients.data();
     const Scratch scratch(way.backward_scratch(job), std::min(threads, patches));
     spread(patches, threads, [&](std::int64_t i, int worker) { way.backward(job, int(i), scratch[worker]); });
-    collect(job, patches, weight_gradients, bias_gradients);
+    collect(job, patches, widths, gradient.data());
 }
 
 std::int64_t kept_bytes(const std::string& instruction_set, int patches, int layers, int height, int width) {
@@ -195,6 +190,9 @@ std::int64_t kept_bytes(const std::string& instruction_set, int patches, int lay
 void bind_convolution(nb::module_& m) {
     m.def("convolution_instruction_sets", &instruction_sets, "Names this processor can run, slowest first.");
     m.def("convolution_kept_bytes", &kept_bytes, "Memory that the way back needs of the way forward.");
+    m.def("convolution_peak",
+          [](const std::string& instruction_set, std::int64_t rounds) { return variant(instruction_set).peak(rounds); },
+          "Runs multiply-adds only; returns how many.");
     m.def("convolution_forward", &forward);
     m.def("convolution_backward", &backward);
 }
