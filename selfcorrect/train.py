@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from selfcorrect.kernel import Guides
 from selfcorrect.loss import dual_buffer_loss, learning_rate, relative_weight
@@ -11,11 +12,12 @@ from selfcorrect.network import Network
 from selfcorrect.patches import batches, steps_count
 from selfcorrect.settings import Settings
 
-__all__ = ["Progress", "train"]
+__all__ = ["Progress", "starting_loss", "train"]
 
 Progress = Callable[[int, int, float], None]
 
 _WARM_UP = 20  # steps over which the cosine schedule reaches its rate
+_SAMPLE = 4  # rows and columns of patches that tell how well a network starts
 
 
 def train(
@@ -30,9 +32,7 @@ def train(
     Returns:
         Eq. 8 before each step. A step whose loss or gradient is not finite is not taken.
     """
-    a, b = (relative_weight(half.denoised, settings.loss_epsilon) for half in guides)
-    if settings.crossed_weights:  # a weight that knows the witness rewards darkening
-        a, b = b, a
+    weights = _weights(guides, settings)
     size = (settings.patch, settings.patch)
     optimiser = torch.optim.Adam(network.parameters(), eps=settings.adam_epsilon)
     rate = learning_rate(guides, settings)
@@ -40,7 +40,7 @@ def train(
     losses: list[float] = []
     for corners in batches((guides[0].height, guides[0].width), settings, generator):
         batch = torch.cat([half.patches(corners, size) for half in guides])
-        loss = dual_buffer_loss(network(batch), corners, guides, (a, b), settings)
+        loss = dual_buffer_loss(network(batch), corners, guides, weights, settings)
         optimiser.zero_grad()
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_limit or math.inf)
@@ -52,6 +52,33 @@ def train(
         if progress is not None:
             progress(len(losses), steps, losses[-1])
     return losses
+
+
+@torch.no_grad()
+def starting_loss(network: Network, guides: tuple[Guides, Guides], settings: Settings) -> float:
+    """Eq. 8 of a network that is not trained any further, over patches spread evenly: the same ones at every call.
+
+    The loss of one network says little, since most of it is noise; the difference of two is that of their errors.
+    """
+    height, width = guides[0].height, guides[0].width
+    size = (min(settings.patch, height), min(settings.patch, width))
+    starts = [
+        torch.linspace(0, length - side, _SAMPLE).long().unique()
+        for length, side in zip((height, width), size, strict=True)
+    ]
+    corners = torch.cartesian_prod(*starts)
+    weights = _weights(guides, settings)
+    losses = []
+    for corner in corners.split(1):  # one at a time: memory as in training, whatever the patch
+        raw = network(torch.cat([half.patches(corner, size) for half in guides]))
+        losses.append(float(dual_buffer_loss(raw, corner, guides, weights, settings)))
+    return sum(losses) / len(losses)
+
+
+def _weights(guides: tuple[Guides, Guides], settings: Settings) -> tuple[Tensor, Tensor]:
+    a, b = (relative_weight(half.denoised, settings.loss_epsilon) for half in guides)
+    # a weight that knows the witness rewards darkening
+    return (b, a) if settings.crossed_weights else (a, b)
 
 
 def _schedule(step: int, steps: int, settings: Settings) -> float:
