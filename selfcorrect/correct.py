@@ -1,6 +1,7 @@
 """Optimise on one frame, infer, guard. No files, no printing, no reference image."""
 
 import copy
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from selfcorrect.kernel import LARGEST, Guides, cross_bilateral
 from selfcorrect.network import Network
 from selfcorrect.patches import overhang
 from selfcorrect.settings import Settings
-from selfcorrect.train import Progress, starting_loss, train
+from selfcorrect.train import Progress, starting_losses, train
 
 __all__ = ["Result", "Start", "correct"]
 
@@ -73,7 +74,7 @@ def correct(
         frame: halves with their denoised images, linear radiance.
         settings: by default the default preset.
         warm_start: the network of the last frame, to go on from with the settings' ``warm_steps``; it is left as it
-            is. Where Eq. 8 says that a new network is the better start, as after a cut, it is not taken.
+            is. Where Eq. 8 does not show it to be the better start, as after a cut, a new one is taken.
         progress: called as ``progress(step, steps, loss)`` after every optimiser step.
 
     Returns:
@@ -109,20 +110,27 @@ def correct(
 
 
 def _warm(settings: Settings) -> Settings:
-    """The settings of a frame that starts warm."""
+    """The settings of a frame that starts warm: never more steps than one that starts cold."""
+    steps = settings.warm_steps or settings.steps
     return replace(
         settings,
-        steps=settings.warm_steps or settings.steps,
+        steps=min(steps, settings.steps or steps),
         learning_rate=settings.warm_learning_rate or settings.learning_rate,
     )
 
 
 def _start(cold: Network, warm: Network, guides: tuple[Guides, Guides], settings: Settings) -> Start:
-    """Which of both networks fits the frame better before any training."""
+    """Which of both networks fits the frame better before any training.
+
+    The network that is given has to be better by more than chance, its standard error over the sample's patches: a
+    frame that starts warm trains for fewer steps, and those would not be enough after a cut.
+    """
     here = copy.deepcopy(cold)  # on the device of the guides
     here.load_state_dict(warm.state_dict())
-    cold_loss, warm_loss = (starting_loss(network, guides, settings) for network in (cold, here))
-    return Start(warm_loss < cold_loss, cold_loss, warm_loss)
+    cold_losses, warm_losses = (starting_losses(network, guides, settings) for network in (cold, here))
+    gain = cold_losses - warm_losses
+    chance = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return Start(float(gain.mean()) > chance, float(cold_losses.mean()), float(warm_losses.mean()))
 
 
 def _automatic_scale(frame: Frame) -> float:

@@ -262,11 +262,10 @@ class _Run:
         return self._network
 
     def _write(self, frame: int, made: str, done: Done) -> Any:
-        """In the writer's thread."""
-        report = done.write()
+        """In the writer's thread. The state comes first: there is no output whose successor could not go on from it."""
         if self.habits.save_state is not None:
             save_state(self._state_file(frame), State(done.network, frame, made), self.habits.settings)
-        return report
+        return done.write()
 
     def _state_file(self, frame: int) -> str:
         pattern = str(self.habits.save_state)

@@ -12,7 +12,7 @@ from selfcorrect.network import Network
 from selfcorrect.patches import batches, steps_count
 from selfcorrect.settings import Settings
 
-__all__ = ["Progress", "starting_loss", "train"]
+__all__ = ["Progress", "starting_losses", "train"]
 
 Progress = Callable[[int, int, float], None]
 
@@ -55,24 +55,20 @@ def train(
 
 
 @torch.no_grad()
-def starting_loss(network: Network, guides: tuple[Guides, Guides], settings: Settings) -> float:
-    """Eq. 8 of a network that is not trained any further, over patches spread evenly: the same ones at every call.
+def starting_losses(network: Network, guides: tuple[Guides, Guides], settings: Settings) -> Tensor:
+    """Eq. 8 of a network as it is, on patches spread evenly over the frame, the same ones at every call: (N,) float64.
 
-    The loss of one network says little, since most of it is noise; the difference of two is that of their errors.
+    One network's loss says little, since most of it is noise; the difference of two is that of their errors.
     """
-    height, width = guides[0].height, guides[0].width
-    size = (min(settings.patch, height), min(settings.patch, width))
-    starts = [
-        torch.linspace(0, length - side, _SAMPLE).long().unique()
-        for length, side in zip((height, width), size, strict=True)
-    ]
-    corners = torch.cartesian_prod(*starts)
+    whole = guides[0].height, guides[0].width
+    size = (min(settings.patch, whole[0]), min(settings.patch, whole[1]))
+    starts = [torch.linspace(0, whole[i] - size[i], _SAMPLE).long().unique() for i in (0, 1)]
     weights = _weights(guides, settings)
     losses = []
-    for corner in corners.split(1):  # one at a time: memory as in training, whatever the patch
+    for corner in torch.cartesian_prod(*starts).split(1):  # one at a time: less memory than a training step
         raw = network(torch.cat([half.patches(corner, size) for half in guides]))
-        losses.append(float(dual_buffer_loss(raw, corner, guides, weights, settings)))
-    return sum(losses) / len(losses)
+        losses.append(dual_buffer_loss(raw, corner, guides, weights, settings).double())
+    return torch.stack(losses)
 
 
 def _weights(guides: tuple[Guides, Guides], settings: Settings) -> tuple[Tensor, Tensor]:
