@@ -7,15 +7,19 @@ import random
 import resource
 import subprocess
 import sys
+import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from test_cli import write_half
 
-from selfcorrect import cli, exr
+from selfcorrect import Settings, cli, exr, files, shot
+from selfcorrect.network import Network
 from selfcorrect.publish import publish, remove_abandoned
 
 FAST = [
@@ -349,6 +353,44 @@ def test_two_processes_on_one_shot(folder: Path) -> None:
     assert cli.main(arguments(folder, out="alone")) == 0
     assert outputs(folder / "out") == outputs(folder / "alone")
     assert len(list((folder / "out").iterdir())) == LAST
+
+
+def test_frames_are_read_ahead_and_written_behind(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a frame is worked on, the next one is read and the last one written; three are in memory at most."""
+    read, begun = ([threading.Event() for _ in range(LAST + 1)] for _ in "rb")
+    alive: list[weakref.ref[files.Loaded]] = []
+    most = 0
+    load = files.load
+
+    def watched(sources: files.Sources) -> files.Loaded:
+        loaded = load(sources)
+        alive.append(weakref.ref(loaded))
+        read[len(alive)].set()
+        return loaded
+
+    def work(job: shot.Job) -> shot.Done:
+        nonlocal most
+        begun[job.frame].set()
+        assert job.frame == LAST or read[job.frame + 1].wait(60)  # read while this frame is being worked on
+        most = max(most, sum(ref() is not None for ref in alive))
+        network = Network(3, 3, Settings(), torch.Generator())
+
+        def write() -> str:
+            assert job.frame == LAST or begun[job.frame + 1].wait(60)  # work on the next frame goes on meanwhile
+            return f"{job.frame} of {job.loaded.frame.size}"
+
+        return shot.Done(network, write)
+
+    monkeypatch.setattr("selfcorrect.shot.files.load", watched)
+    (folder / "out").mkdir()
+    names = [str(folder / name) for name in ("a.####.exr", "b.####.exr", "out/x.####.exr")]
+    habits = shot.Habits(Settings(), {})
+    outcomes: list[shot.Outcome] = []
+    assert shot.run(shot.Shot(*names, range(1, LAST + 1)), habits, work, outcomes.append, print) == 0
+    assert [(o.frame, o.kind, o.report) for o in outcomes] == [
+        (n, "written", f"{n} of (24, 30)") for n in range(1, LAST + 1)
+    ]
+    assert most <= 3
 
 
 def test_killed_at_any_moment(tmp_path: Path) -> None:
