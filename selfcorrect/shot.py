@@ -7,6 +7,7 @@ again, and two runs on the same shot do no more harm than to do the work twice.
 
 import hashlib
 import json
+import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -209,10 +210,17 @@ class _Run:
 
     def _check(self) -> None:
         for frame in self.shot.frames[:1]:
-            self.shot.sources(frame)
+            self._check_apart(self.shot.sources(frame), self.shot.target(frame))
             remove_abandoned(exr.check_target(self.shot.target(frame)).parent)
             if self.habits.save_state is not None:
                 remove_abandoned(check_state_target(self._state_file(frame)).parent)
+
+    def _check_apart(self, sources: files.Sources, output: str) -> None:
+        """An output in place of an input would be corrected once more by the run that resumes this one."""
+        given = (sources.a, sources.b, sources.denoised_a, sources.denoised_b, sources.denoised)
+        for path in given:
+            if path is not None and os.path.realpath(path.partition("::")[0]) == os.path.realpath(output):
+                raise FileError(f"{output}: expected an output apart from the inputs, but got one of them")
 
     def _ahead(self, reader: ThreadPoolExecutor, frames: Any) -> tuple[int, "Future[_Fetched]"] | None:
         frame = next(frames, None)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from selfcorrect import Frame, Settings, correct, correct_sequence
+import denoisers
+from selfcorrect import Frame, Settings, correct, correct_sequence, exr, metrics
 from selfcorrect.errors import FrameError
 
 SMALL = Settings.preset("paper", patch=32, stride=16, batch=4, epochs=2, window=7)
@@ -200,9 +201,6 @@ def test_the_road_of_other_devices_gives_the_same_frame(monkeypatch: pytest.Monk
 @pytest.mark.shared
 def test_a_real_frame_gets_better(shared: Path) -> None:
     """Bathroom at 64 spp: the published method is 0.69 of OIDN's error; three epochs must already gain."""
-    import denoisers
-    from selfcorrect import exr, metrics
-
     names = ("064spp_A", "064spp_B", "ref_A", "ref_B", "ref_smooth")
     a, b, *references = (exr.load_half(str(shared / f"frames/bathroom_{n}.exr")).buffers for n in names)
     buffers = {role: (a[role], b[role]) for role in ("color", "albedo", "normal")}
@@ -214,3 +212,22 @@ def test_a_real_frame_gets_better(shared: Path) -> None:
     noisy = np.mean([x.mean() for x in buffers["color"]])
     assert corrected < denoised
     assert result.image.mean() == pytest.approx(noisy, rel=0.02)
+
+
+@pytest.mark.shared
+def test_next_frame_of_a_shot_starts_warm_and_another_scene_cold(shared: Path) -> None:
+    """Real frames, a part of each to be quick; scripts/bench_shot.py measures what the warm start gains."""
+
+    def load(name: str, halves: str) -> Frame:
+        a, b = (exr.load_half(shared / name.format(half)).buffers for half in halves)
+        part = (slice(20, 148), slice(60, 188))
+        frame = Frame(**{role: (a[role][part], b[role][part]) for role in ("color", "albedo", "normal")})
+        return frame.denoise(denoisers.create("oidn", threads=1))
+
+    shot = "shot/living-room-2_{}.%04d.exr"
+    network = correct(load(shot % 1, "ab"), Settings.preset("balanced", steps=80)).network
+    started = [
+        correct(frame, Settings.preset("balanced", steps=1), warm_start=network).start.warm
+        for frame in (load(shot % 2, "ab"), load("frames/staircase_064spp_{}.exr", "AB"))
+    ]
+    assert started == [True, False]

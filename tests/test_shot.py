@@ -290,6 +290,7 @@ class TestRefused:
             ({"x.####.exr": "x.exr"}, "a place for the frame number"),
             ({"1-5": "5-1"}, "rising order"),
             ({"out": "nowhere"}, "create it first"),
+            ({"out/x.####.exr": "a.####.exr"}, "apart from the inputs"),
         ],
     )
     def test_names_and_ranges(self, folder: Path, run: Run, change: dict[str, str], reason: str) -> None:
