@@ -8,6 +8,7 @@ import resource
 import subprocess
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -400,41 +401,46 @@ def test_killed_at_any_moment(tmp_path: Path) -> None:
     The processes run the command from a fork server that has imported it, since they would otherwise spend all
     their life with that.
     """
-    last, rng = 12, random.Random(1)
+    last, rng = 6, random.Random(1)
     folder = write_shot(tmp_path, last)
-    state = ["--save-state", folder / "state.####.safetensors"]
-    assert cli.main(arguments(folder, *state, last=last, out="undisturbed")) == 0
-    undisturbed = outputs(folder / "undisturbed")
-    for path in folder.glob("state.*"):
-        path.unlink()
-
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["selfcorrect.cli"])
-    given = arguments(folder, *state, "--skip-existing", last=last)
-    context.Process(target=cli.main, args=(["inspect", str(folder / "a.0001.exr")],)).start()  # warm the server up
-    kills, checked, finished = 0, set(), 0
-    while kills < 50:
+    context.set_forkserver_preload(["selfcorrect.cli", "torch._dynamo"])  # the latter is imported by the first step
+
+    def started(out: str) -> multiprocessing.process.BaseProcess:
+        state = ["--save-state", folder / out / "state.####.safetensors"]
+        given = arguments(folder, *state, "--skip-existing", last=last, out=out)
         process = context.Process(target=cli.main, args=(given,))
         process.start()
-        process.join(rng.uniform(0.02, 0.8))
+        return process
+
+    started("warm-up").join()  # the server imports the command
+    begin = time.perf_counter()
+    started("undisturbed").join()
+    whole = time.perf_counter() - begin
+    undisturbed = outputs(folder / "undisturbed")
+    assert len(undisturbed) == last
+
+    checked: set[tuple[Path, int]] = set()
+    kills = 0
+    while kills < 50:
+        process = started("out")
+        process.join(rng.uniform(0, whole))
         if process.exitcode is None:
             process.kill()
             kills += 1
         process.join()
-        there = {(p, p.stat().st_mtime_ns) for p in (folder / "out").glob("*.exr")}
+        there = {(path, path.stat().st_mtime_ns) for path in (folder / "out").glob("*.exr")}
         for path, _ in there - checked:
             exr.read(path)
             assert path.read_bytes() == undisturbed[path.name]
         checked |= there
-        if len(there) == last:  # finished: once more from the start
-            finished += 1
-            for path, _ in there:
+        if len(there) == last:  # once more from the start
+            for path in [*(folder / "out").glob("*.exr"), *(folder / "out").glob("state.*")]:
                 path.unlink()
-    process = context.Process(target=cli.main, args=(given,))
-    process.start()
-    process.join()
+    started("out").join()
     assert outputs(folder / "out") == undisturbed
     assert not list(folder.rglob("*tmp*"))
+    assert len(checked) > last  # the kills did not all come before the first frame
 
 
 def test_temporaries_of_the_living_stay(tmp_path: Path) -> None:
