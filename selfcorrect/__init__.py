@@ -3,6 +3,18 @@
 from selfcorrect.correct import Result, correct
 from selfcorrect.errors import SelfcorrectError
 from selfcorrect.frame import Frame
+from selfcorrect.sequence import correct_sequence
 from selfcorrect.settings import Settings
+from selfcorrect.state import State, load_state, save_state
 
-__all__ = ["Frame", "Result", "SelfcorrectError", "Settings", "correct"]
+__all__ = [
+    "Frame",
+    "Result",
+    "SelfcorrectError",
+    "Settings",
+    "State",
+    "correct",
+    "correct_sequence",
+    "load_state",
+    "save_state",
+]

@@ -1,8 +1,10 @@
 """Optimise on one frame, infer, guard. No files, no printing, no reference image."""
 
+import copy
+import math
 import time
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,9 +16,23 @@ from selfcorrect.kernel import LARGEST, Guides, cross_bilateral
 from selfcorrect.network import Network
 from selfcorrect.patches import overhang
 from selfcorrect.settings import Settings
-from selfcorrect.train import Progress, train
+from selfcorrect.train import Progress, starting_losses, train
 
-__all__ = ["Result", "correct"]
+__all__ = ["Result", "Start", "correct"]
+
+
+class Start(NamedTuple):
+    """What training began from.
+
+    Attributes:
+        warm: from the network that was given, not from a new one.
+        cold_loss: Eq. 8 of a new network on a sample of the frame; None where no network was given.
+        warm_loss: the same of the network that was given.
+    """
+
+    warm: bool
+    cold_loss: float | None = None
+    warm_loss: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +48,7 @@ class Result:
         aovs: the guard's maps, each (H, W): ``blend`` (weight of the corrected image), and ``error.before`` and
             ``error.after`` (estimated relative squared error); empty where the guard is off.
         input_scale: what radiance was multiplied by.
+        start: whether training went on from ``warm_start``, and why.
     """
 
     image: Any
@@ -41,6 +58,7 @@ class Result:
     estimate: Estimate | None
     aovs: dict[str, Tensor]
     input_scale: float
+    start: Start
 
 
 def correct(
@@ -55,7 +73,8 @@ def correct(
     Args:
         frame: halves with their denoised images, linear radiance.
         settings: by default the default preset.
-        warm_start: the network of another frame with the same buffers to start from; it is left as it is.
+        warm_start: the network of the last frame, to go on from with the settings' ``warm_steps``; it is left as it
+            is. Where Eq. 8 does not show it to be the better start, as after a cut, a new one is taken.
         progress: called as ``progress(step, steps, loss)`` after every optimiser step.
 
     Returns:
@@ -68,26 +87,50 @@ def correct(
     settings = settings or Settings.preset(Settings.default())
     if frame.denoised is None:
         raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
-    start = time.perf_counter()
+    began = time.perf_counter()
     scale = settings.input_scale or _automatic_scale(frame)
     halves = _scaled(frame, scale)
-    margin = overhang(frame.size, settings) + settings.window // 2
+    warm = _warm(settings)
+    margin = max(overhang(frame.size, s) for s in (settings, warm)) + settings.window // 2
     guides = (_guides(halves[0], margin), _guides(halves[1], margin))
     generator = torch.Generator().manual_seed(settings.seed)
     network = Network.for_guides(guides[0], settings, generator)
+    start = Start(warm=False)
     if warm_start is not None:
-        if warm_start.shape != network.shape:
-            raise FrameError(
-                f"expected a warm start with weights {network.shape[0]} … {network.shape[-2]}, "
-                f"but got {warm_start.shape[0]} … {warm_start.shape[-2]}: other buffers or settings"
-            )
+        network.traits.check(warm_start.traits)
+        start = _start(network, warm_start, guides, settings)
+    if start.warm and warm_start is not None:
         network.load_state_dict(warm_start.state_dict())
-    losses = train(network, guides, settings, generator, progress)
+    losses = train(network, guides, warm if start.warm else settings, generator, progress)
     trained = time.perf_counter()
     image, guarded = _finish(frame, halves, network, settings, scale)
     estimate, aovs = (guarded.estimate, _aovs(guarded)) if guarded else (None, {})
-    seconds = {"train": trained - start, "infer": time.perf_counter() - trained}
-    return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale)
+    seconds = {"train": trained - began, "infer": time.perf_counter() - trained}
+    return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale, start)
+
+
+def _warm(settings: Settings) -> Settings:
+    """The settings of a frame that starts warm: never more steps than one that starts cold."""
+    steps = settings.warm_steps or settings.steps
+    return replace(
+        settings,
+        steps=min(steps, settings.steps or steps),
+        learning_rate=settings.warm_learning_rate or settings.learning_rate,
+    )
+
+
+def _start(cold: Network, warm: Network, guides: tuple[Guides, Guides], settings: Settings) -> Start:
+    """Which of both networks fits the frame better before any training.
+
+    The network that is given has to be better by more than chance, its standard error over the sample's patches: a
+    frame that starts warm trains for fewer steps, and those would not be enough after a cut.
+    """
+    here = copy.deepcopy(cold)  # on the device of the guides
+    here.load_state_dict(warm.state_dict())
+    cold_losses, warm_losses = (starting_losses(network, guides, settings) for network in (cold, here))
+    gain = cold_losses - warm_losses
+    chance = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return Start(float(gain.mean()) > chance, float(cold_losses.mean()), float(warm_losses.mean()))
 
 
 def _automatic_scale(frame: Frame) -> float:

@@ -12,10 +12,8 @@ What the OpenEXR library cannot keep by itself when a file passes through, and w
 Sources: https://openexr.com/en/latest/OpenEXRFileLayout.html and trials with OpenEXR 3.5.
 """
 
-import contextlib
 import io
 import os
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +28,7 @@ from selfcorrect.errors import ChannelError, FileError, FrameError
 from selfcorrect.exrfile import LIBRARY_ERRORS, ExrFile, Part, Pixels, one_line, quiet, read
 from selfcorrect.exrheader import Window
 from selfcorrect.inspection import Inspection, inspect
+from selfcorrect.publish import publish
 
 __all__ = ["ExrFile", "Half", "Inspection", "check_target", "inspect", "load_half", "read", "write"]
 
@@ -152,7 +151,7 @@ def write(
         known = values.dtype in (np.float16, np.float32, np.uint32)
         contents[beside][name] = values if known else values.astype(np.float32)
     added = {name: text.encode(errors="backslashreplace").decode() for name, text in attributes.items()}
-    _publish(target, _encode(source, contents, added, str(path)))
+    publish(target, _encode(source, contents, added, str(path)))
     return clipped
 
 
@@ -214,21 +213,3 @@ def check_target(path: str | Path) -> Path:
     if os.path.exists(target) and not os.access(target, os.W_OK):
         raise FileError(f"{path}: expected a file to overwrite, but got a read-only one; choose another")
     return target
-
-
-def _publish(target: Path, data: bytearray) -> None:
-    """Write the file under a temporary name beside its own, then rename it."""
-    temporary = target.with_name(f".{target.stem[:100]}.{secrets.token_hex(8)}.tmp")
-    try:
-        with open(temporary, "xb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, target)
-    except OSError as error:
-        raise FileError(
-            f"{target}: expected a folder to write to, but got: {error.strerror}; choose another output"
-        ) from None
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)

@@ -22,14 +22,15 @@ from selfcorrect import channels, exrheader
 from selfcorrect.errors import ChannelError, FileError
 from selfcorrect.exrheader import Attribute, Window
 
-__all__ = ["LIBRARY_ERRORS", "ExrFile", "Part", "Pixels", "one_line", "quiet", "read"]
+__all__ = ["LIBRARY_ERRORS", "OUTPUT", "ExrFile", "Part", "Pixels", "one_line", "quiet", "read"]
 
 Pixels = NDArray[Any]
 
 LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, IndexError, MemoryError)
 """What the OpenEXR library raises for a file or an image that it does not like."""
 
-_STDERR = threading.Lock()
+OUTPUT = threading.RLock()
+"""Held while the library is kept from stdout and stderr: who prints in another thread takes it, or is not heard."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +176,9 @@ def _part(part: Any, header: exrheader.Header) -> Part:
 def quiet() -> Iterator[None]:
     """Keep the library from writing to stdout (from Python) and stderr (from C) what it raises anyway.
 
-    Both are the process's, so what another thread prints meanwhile is lost too.
+    Both are the process's: what another thread prints meanwhile without :data:`OUTPUT` is lost too.
     """
-    with _STDERR, contextlib.redirect_stdout(io.StringIO()), open(os.devnull, "wb") as nowhere:
+    with OUTPUT, contextlib.redirect_stdout(io.StringIO()), open(os.devnull, "wb") as nowhere:
         try:
             stderr = os.dup(2)
         except OSError:  # closed: nothing to keep the library from

@@ -30,6 +30,7 @@ __all__ = [
     "relmse_ratio",
     "relmse_standard_error",
     "ssim",
+    "temporal_error",
     "tone_map",
 ]
 
@@ -185,6 +186,48 @@ def relmse_ratio(
     means_a, means_b = _resampled_means(errors, seed).unbind(1)
     uncertain = bool((means_b <= 0).any())
     return Estimate(error_a / error_b, math.inf if uncertain else float((means_a / means_b).std()))
+
+
+def temporal_error(
+    image: Image,
+    previous: Image,
+    reference: tuple[Image, Image],
+    reference_b: tuple[Image, Image],
+    weight: tuple[Image, Image] | None = None,
+) -> float:
+    r"""Flicker: the error of the change from one frame of a shot to the next, in the units of `relmse`.
+
+    .. math::
+        \frac{1}{3N} \sum_{c,k} \frac{(\Delta x_{ck} - \Delta r^A_{ck})(\Delta x_{ck} - \Delta r^B_{ck})}
+        {\frac{1}{2}(\bar{s}_{t,c}^2 + \bar{s}_{t-1,c}^2) + 0.01}, \qquad \Delta x = x_t - x_{t-1}
+
+    The noise of the references cancels in expectation, as in `relmse`. Two frames whose errors are equal have none;
+    where errors are independent it is the sum of both relMSEs, since a static error is no flicker. What moves in the
+    picture takes its static error along, and that counts.
+
+    Args:
+        image: x of frame t, (H, W, 3) linear radiance.
+        previous: x of frame t − 1, of the same shape.
+        reference: r^A of frame t and of frame t − 1.
+        reference_b: r^B of both, rendered independently of r^A.
+        weight: s of both, as in `relmse`; without it, the means of the references.
+
+    Returns:
+        The error, unbiased, 0 is best; it may fall below 0 by chance.
+
+    Source:
+        This project's.
+    """
+    x = _radiance("image", image)
+    change = x - _radiance("previous", previous, like=x)
+    a, b = (
+        [_radiance(name, each, like=x) for each in pair]
+        for name, pair in (("reference", reference), ("reference_b", reference_b))
+    )
+    given = [(a[i] + b[i]) / 2 for i in (0, 1)] if weight is None else [_radiance("weight", s, like=x) for s in weight]
+    level = sum(s.mean(dim=-1) ** 2 for s in given) / 2 + 0.01
+    errors = ((change - (a[0] - a[1])) * (change - (b[0] - b[1]))).mean(dim=-1) / level
+    return float(errors.mean())
 
 
 def psnr(image: Image, reference: Image) -> float:

@@ -3,14 +3,16 @@
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from selfcorrect.errors import FrameError
 from selfcorrect.kernel import Guides, convolution, heads_count
 from selfcorrect.settings import Settings
 
-__all__ = ["Network"]
+__all__ = ["Network", "Traits", "buffer_names"]
 
 # What the residual initialisation's heads start at: g is close to z_c plus the mean of y_i − z_i over pixels like c,
 # with wide bandwidths in the noisy radiance and narrow ones in the buffers that have little noise.
@@ -18,6 +20,57 @@ _START_BETA_Z = 0.9
 _START_GAMMA = {"y": 3.0, "z": 1.0, "albedo": 0.2, "normal": 0.4, "visibility": 0.2}
 _START_TAU = 0.05
 _START_SPREAD = 0.1  # of the last layer's weights: heads start near the same value everywhere
+
+
+def buffer_names(*, albedo: bool, visibility: bool, normal: bool) -> str:
+    """What a network sees, in the order of its inputs.
+
+    >>> buffer_names(albedo=True, visibility=False, normal=True)
+    'color+albedo+normal+denoised'
+    """
+    there = {"color": True, "albedo": albedo, "visibility": visibility, "normal": normal, "denoised": True}
+    return "+".join(name for name, is_there in there.items() if is_there)
+
+
+class Traits(NamedTuple):
+    """What two networks must share for one to go on from the other: what their inputs and outputs mean.
+
+    Weights of the same shape are not enough: albedo and normal have as many channels, and a bandwidth means another
+    thing in another window.
+
+    Attributes:
+        buffers: the guides' buffers, in their order.
+        combination, window, layers, filters, log_radiance: as in the settings.
+        input_scale: as in the settings; 0 is that of each frame.
+    """
+
+    buffers: str
+    combination: str
+    window: int
+    layers: int
+    filters: int
+    log_radiance: bool
+    input_scale: float
+
+    @classmethod
+    def of(cls, guides: Guides, settings: Settings) -> "Traits":
+        """The traits of the network that these guides and settings ask for."""
+        buffers = buffer_names(albedo=guides.has_albedo, visibility=guides.has_visibility, normal=guides.has_normal)
+        own = [getattr(settings, name) for name in cls._fields[1:]]
+        return cls(buffers, *own)
+
+    def check(self, given: "Traits") -> None:
+        """Raise a FrameError that names the first trait in which ``given`` differs."""
+        for name, expected, got in zip(self._fields, self, given, strict=True):
+            if expected != got:
+                raise FrameError(
+                    f"expected a warm start with {name} {expected}, but got one with {got}: other buffers or settings"
+                )
+
+    def check_settings(self, settings: Settings) -> None:
+        """Raise a FrameError where other settings than these made the network; the buffers may be any."""
+        own = [getattr(settings, name) for name in self._fields[1:]]
+        Traits(self.buffers, *own).check(self)
 
 
 class Network(nn.Module):
@@ -28,7 +81,12 @@ class Network(nn.Module):
         heads: raw outputs per pixel, see :func:`selfcorrect.kernel.heads_count`.
         settings: ``filters``, ``layers``, ``log_radiance``, ``precision``.
         generator: source of the first weights.
+
+    Attributes:
+        traits: what another network must share to go on from this one; :meth:`for_guides` sets them.
     """
+
+    traits: Traits
 
     def __init__(self, inputs: int, heads: int, settings: Settings, generator: torch.Generator):
         super().__init__()
@@ -50,6 +108,7 @@ class Network(nn.Module):
         network = cls(guides.planes.shape[0], heads, settings, generator)
         if settings.initialisation == "residual":
             network._start_at_residual(guides, settings.combination)
+        network.traits = Traits.of(guides, settings)
         network.to(guides.planes.device)
         return network
 
@@ -63,11 +122,6 @@ class Network(nn.Module):
         with torch.no_grad():
             last.weight.mul_(_START_SPREAD)
             last.bias.copy_(torch.tensor([*betas, *(math.log(math.expm1(value)) for value in (*gammas, _START_TAU))]))
-
-    @property
-    def shape(self) -> list[tuple[int, ...]]:
-        """Shapes of all weights: two networks with the same shape can be exchanged."""
-        return [tuple(p.shape) for p in self.parameters()]
 
     def forward(self, guides: Tensor | Sequence[Tensor]) -> Tensor:
         """Guides, N of (C, h, w), to raw heads (N, heads, h, w); on the CPU as the compiled kernel computes them."""

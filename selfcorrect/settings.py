@@ -10,6 +10,7 @@ __all__ = ["Settings"]
 
 _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench_quality.py measures it"
+_WARM = "not in the paper; scripts/bench_shot.py measures it"
 
 
 def _setting(default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0) -> Any:
@@ -61,7 +62,9 @@ class Settings:
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
     epochs: int = _setting(20, "passes over all patches", f"{_PAPER}, Sec. 4", least=0)
     steps: int = _setting(0, "optimiser steps on patches drawn at random; 0 counts epochs", _OURS)
+    warm_steps: int = _setting(0, "steps of a frame that starts warm, at most those of any frame; 0 takes those", _WARM)
     learning_rate: float = _setting(0.01, "Adam's rate", f"{_PAPER}, published code")
+    warm_learning_rate: float = _setting(0.0, "rate of a frame that starts warm; 0 takes that of any frame", _WARM)
     rate_from_variance: bool = _setting(
         True, "multiply the rate by the root of the halves' variance", f"{_PAPER}, published code"
     )
@@ -111,7 +114,9 @@ class Settings:
                 patch=64,
                 batch=4,
                 steps=400,
+                warm_steps=133,
                 learning_rate=1e-3,
+                warm_learning_rate=5e-4,
                 rate_from_variance=False,
                 schedule="cosine",
                 gradient_limit=1.0,

@@ -1,5 +1,6 @@
 """correct(): reproducible, warm start, kinds of arrays, and a real frame made better."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from selfcorrect import Frame, Settings, correct
+import denoisers
+from selfcorrect import Frame, Settings, correct, correct_sequence, exr, metrics
 from selfcorrect.errors import FrameError
 
 SMALL = Settings.preset("paper", patch=32, stride=16, batch=4, epochs=2, window=7)
@@ -63,6 +65,71 @@ def test_warm_start_of_other_buffers_is_refused() -> None:
     network = correct(make_frame(), SMALL).network
     with pytest.raises(FrameError, match="other buffers or settings"):
         correct(make_frame(albedo=True), SMALL, warm_start=network)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"log_radiance": True}, "log_radiance True, but got one with False"),
+        ({"window": 9}, "window 9"),
+        ({"combination": "eq3"}, "combination eq3"),
+        ({"input_scale": 0.0}, "input_scale 0.0"),
+    ],
+)
+def test_warm_start_of_other_settings_is_refused(change: dict[str, Any], reason: str) -> None:
+    """Also where the weights have the same shapes: what they mean is another thing."""
+    network = correct(make_frame(), SMALL).network
+    with pytest.raises(FrameError, match=reason):
+        correct(make_frame(), Settings.from_dict(SMALL.to_dict() | change), warm_start=network)
+
+
+def test_warm_start_of_albedo_for_normal_is_refused() -> None:
+    frame = make_frame(albedo=True)
+    network = correct(frame, SMALL).network
+    other = Frame(color=frame.color, denoised=frame.denoised, normal=frame.albedo)
+    with pytest.raises(FrameError, match=r"color\+normal\+denoised, but got one with color\+albedo\+denoised"):
+        correct(other, SMALL, warm_start=network)
+
+
+def test_a_network_that_fits_worse_than_a_new_one_is_not_taken() -> None:
+    """It has been trained to put stripes where this frame's witness has none."""
+    settings = Settings.preset("balanced", patch=16, batch=2, steps=20, window=7)
+    other = correct(make_frame(albedo=True), settings).network
+    with torch.no_grad():
+        for weights in other.parameters():
+            weights.mul_(-1)
+    start = correct(make_frame(albedo=True), settings, warm_start=other).start
+    assert start.cold_loss is not None
+    assert start.warm_loss is not None
+    assert not start.warm
+    assert start.warm_loss > start.cold_loss
+
+
+def test_sequence_is_the_chain_of_single_frames() -> None:
+    settings = Settings.preset("balanced", patch=16, batch=2, steps=6, warm_steps=3, window=7)
+    frames = [make_frame(seed=seed) for seed in range(3)]
+    first = correct(frames[0], settings)
+    second = correct(frames[1], settings, warm_start=first.network)
+    third = correct(frames[2], settings, warm_start=second.network)
+    read: list[Frame] = []
+
+    def reading() -> Iterator[Frame]:
+        for frame in frames:
+            read.append(frame)
+            yield frame
+
+    results = correct_sequence(reading(), settings)
+    for count, expected in enumerate((first, second, third), start=1):
+        result = next(results)
+        np.testing.assert_array_equal(result.image, expected.image)
+        assert result.start == expected.start
+        assert len(result.losses) == (3 if result.start.warm else 6)
+        assert len(read) == count  # no frame is asked for before its time
+    cold = list(correct_sequence(frames, settings, cold=True))
+    assert [result.start.warm for result in cold] == [False] * 3
+    np.testing.assert_array_equal(cold[2].image, correct(frames[2], settings).image)
+    key = list(correct_sequence(frames, settings, cold=True, warm_start=first.network))
+    assert all(result.start.warm_loss is not None for result in key)
 
 
 def test_denoised_halves_are_needed() -> None:
@@ -134,9 +201,6 @@ def test_the_road_of_other_devices_gives_the_same_frame(monkeypatch: pytest.Monk
 @pytest.mark.shared
 def test_a_real_frame_gets_better(shared: Path) -> None:
     """Bathroom at 64 spp: the published method is 0.69 of OIDN's error; three epochs must already gain."""
-    import denoisers
-    from selfcorrect import exr, metrics
-
     names = ("064spp_A", "064spp_B", "ref_A", "ref_B", "ref_smooth")
     a, b, *references = (exr.load_half(str(shared / f"frames/bathroom_{n}.exr")).buffers for n in names)
     buffers = {role: (a[role], b[role]) for role in ("color", "albedo", "normal")}
@@ -148,3 +212,22 @@ def test_a_real_frame_gets_better(shared: Path) -> None:
     noisy = np.mean([x.mean() for x in buffers["color"]])
     assert corrected < denoised
     assert result.image.mean() == pytest.approx(noisy, rel=0.02)
+
+
+@pytest.mark.shared
+def test_next_frame_of_a_shot_starts_warm_and_another_scene_cold(shared: Path) -> None:
+    """Real frames, a part of each to be quick; scripts/bench_shot.py measures what the warm start gains."""
+
+    def load(name: str, halves: str) -> Frame:
+        a, b = (exr.load_half(shared / name.format(half)).buffers for half in halves)
+        part = (slice(20, 148), slice(60, 188))
+        frame = Frame(**{role: (a[role][part], b[role][part]) for role in ("color", "albedo", "normal")})
+        return frame.denoise(denoisers.create("oidn", threads=1))
+
+    shot = "shot/living-room-2_{}.%04d.exr"
+    network = correct(load(shot % 1, "ab"), Settings.preset("balanced", steps=80)).network
+    started = [
+        correct(frame, Settings.preset("balanced", steps=1), warm_start=network).start.warm
+        for frame in (load(shot % 2, "ab"), load("frames/staircase_064spp_{}.exr", "AB"))
+    ]
+    assert started == [True, False]

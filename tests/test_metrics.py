@@ -50,6 +50,38 @@ def test_relmse_with_two_references_and_a_smooth_one() -> None:
     assert smooth != pytest.approx(mean, rel=0.01)
 
 
+def test_temporal_error() -> None:
+    x, y, *references = (radiance(seed) for seed in range(8))
+    a, b, s = references[:2], references[2:4], references[4:]
+    product = ((x - y) - (a[0] - a[1])) * ((x - y) - (b[0] - b[1]))
+
+    def expected(weight: list[np.ndarray]) -> float:
+        level = sum(w.mean(axis=2, keepdims=True) ** 2 for w in weight) / 2 + 0.01
+        return float(np.mean(product / level))
+
+    pairs = (tuple(a), tuple(b))
+    assert metrics.temporal_error(x, y, *pairs, tuple(s)) == pytest.approx(expected(s), rel=1e-12)
+    means = [(a[i] + b[i]) / 2 for i in (0, 1)]
+    assert metrics.temporal_error(x, y, *pairs) == pytest.approx(expected(means), rel=1e-12)
+
+
+def test_temporal_error_knows_flicker_and_no_static_error() -> None:
+    """Unbiased with noisy references: a static error has none, independent errors add up."""
+    truth = radiance(0, (128, 128, 3))
+    rng = np.random.default_rng(1)
+
+    def noise(size: float) -> np.ndarray:
+        return rng.normal(0, size, truth.shape)
+
+    references = [tuple(truth + noise(0.2) for _ in range(2)) for _ in "ab"]
+    smooth = (truth, truth)
+    static = noise(0.1)
+    assert metrics.temporal_error(truth + static, truth + static, *references, smooth) == pytest.approx(0, abs=0.02)
+    one, two = truth + noise(0.5), truth + noise(0.5)
+    both = metrics.relmse(one, truth) + metrics.relmse(two, truth)
+    assert metrics.temporal_error(one, two, *references, smooth) == pytest.approx(both, rel=0.05)
+
+
 def test_relmse_is_unbiased_with_noisy_references() -> None:
     truth = radiance(0)
     x = truth * 1.1
