@@ -3,7 +3,9 @@
 import copy
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -12,13 +14,17 @@ from torch import Tensor
 from selfcorrect.errors import FrameError
 from selfcorrect.frame import Frame, Half, mean
 from selfcorrect.guard import Estimate, Guarded, guard, keep_light, trust_in_full
-from selfcorrect.kernel import LARGEST, Guides, cross_bilateral
+from selfcorrect.infer import infer, infer_tile
+from selfcorrect.kernel import LARGEST, Guides
 from selfcorrect.network import Network
-from selfcorrect.patches import overhang
+from selfcorrect.patches import crops, overhang
 from selfcorrect.settings import Settings
-from selfcorrect.train import Progress, starting_losses, train
+from selfcorrect.train import Limits, Progress, starting_losses, train
 
 __all__ = ["Result", "Start", "correct"]
+
+_TRIAL = 256  # side of the tile whose time is taken for the time budget
+_GUARD_SECONDS = 2e-6  # a pixel, with some to spare
 
 
 class Start(NamedTuple):
@@ -67,6 +73,7 @@ def correct(
     *,
     warm_start: Network | None = None,
     progress: Progress | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> Result:
     """Correct a denoised frame (Back et al. 2022).
 
@@ -76,6 +83,7 @@ def correct(
         warm_start: the network of the last frame, to go on from with the settings' ``warm_steps``; it is left as it
             is. Where Eq. 8 does not show it to be the better start, as after a cut, a new one is taken.
         progress: called as ``progress(step, steps, loss)`` after every optimiser step.
+        stop: asked before every optimiser step; when it says True, training ends and the result so far is inferred.
 
     Returns:
         The corrected image and the network. The same seed gives the same bits on the same machine and number of
@@ -89,11 +97,8 @@ def correct(
         raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
     began = time.perf_counter()
     scale = settings.input_scale or _automatic_scale(frame)
-    halves = _scaled(frame, scale)
-    warm = _warm(settings)
-    margin = max(overhang(frame.size, s) for s in (settings, warm)) + settings.window // 2
-    guides = (_guides(halves[0], margin), _guides(halves[1], margin))
     generator = torch.Generator().manual_seed(settings.seed)
+    guides = _training_guides(frame, settings, scale, generator)
     network = Network.for_guides(guides[0], settings, generator)
     start = Start(warm=False)
     if warm_start is not None:
@@ -101,12 +106,55 @@ def correct(
         start = _start(network, warm_start, guides, settings)
     if start.warm and warm_start is not None:
         network.load_state_dict(warm_start.state_dict())
-    losses = train(network, guides, warm if start.warm else settings, generator, progress)
+    limits = Limits(stop=stop or Limits.stop)
+    if settings.time_budget:
+        reserved = _seconds_after_training(network, frame, settings, scale)
+        limits = replace(limits, seconds=settings.time_budget - reserved - (time.perf_counter() - began))
+    losses = train(network, guides, _warm(settings) if start.warm else settings, generator, progress, limits)
+    del guides
     trained = time.perf_counter()
-    image, guarded = _finish(frame, halves, network, settings, scale)
+    image, guarded = _finish(frame, network, settings, scale)
     estimate, aovs = (guarded.estimate, _aovs(guarded)) if guarded else (None, {})
     seconds = {"train": trained - began, "infer": time.perf_counter() - trained}
     return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale, start)
+
+
+def _training_guides(
+    frame: Frame, settings: Settings, scale: float, generator: torch.Generator
+) -> tuple[Guides, Guides]:
+    """What the network is trained on: both halves whole, or crops of them at the same places."""
+    margin = settings.window // 2
+    regions = crops(frame.size, settings, generator)
+    if not regions:
+        margin += max(overhang(frame.size, s) for s in (settings, _warm(settings)))
+
+    def one(half: Half) -> Guides:
+        assert half.denoised is not None  # correct() has checked; tells the type checker
+        cut = partial(
+            Guides.of_half,
+            half.color,
+            half.denoised,
+            margin=margin,
+            albedo=half.albedo,
+            normal=half.normal,
+            visibility=half.visibility,
+            scale=scale,
+        )
+        return Guides.stack([cut(region=region) for region in regions]) if regions else cut()
+
+    return one(frame.halves[0]), one(frame.halves[1])
+
+
+def _seconds_after_training(network: Network, frame: Frame, settings: Settings, scale: float) -> float:
+    """How long inference and guard will take, by the time of a small tile."""
+    half, pixels = frame.halves[0], frame.size[0] * frame.size[1]
+    region = (0, 0, min(frame.size[0], _TRIAL), min(frame.size[1], _TRIAL))
+    infer_tile(network, half, settings, region, scale=scale)  # the first call is slower
+    start = time.perf_counter()
+    infer_tile(network, half, settings, region, scale=scale)
+    inference = (time.perf_counter() - start) / (region[2] * region[3])
+    passes = 4 if settings.inference == "full" else 2
+    return pixels * (inference * passes + (_GUARD_SECONDS if settings.guard else 0.0))
 
 
 def _warm(settings: Settings) -> Settings:
@@ -140,82 +188,39 @@ def _automatic_scale(frame: Frame) -> float:
     return float(1 / roots**2) if roots > 0 else 1.0
 
 
-def _scaled(frame: Frame, scale: float) -> tuple[Half, Half]:
-    """Both halves with their radiance scaled, and bounded so that its squares stay finite."""
-
-    def one(half: Half) -> Half:
-        assert half.denoised is not None  # correct() has checked; tells the type checker
-        return half._replace(color=_bounded(half.color, scale), denoised=_bounded(half.denoised, scale))
-
-    return one(frame.halves[0]), one(frame.halves[1])
-
-
 def _bounded(radiance: Tensor, scale: float) -> Tensor:
+    """Scaled, and bounded so that squares stay finite."""
     return (radiance.double() * scale).clamp(max=LARGEST).float()
-
-
-def _guides(half: Half, margin: int, denoised: Tensor | None = None) -> Guides:
-    """Buffers of a half, padded; with another denoised image where one is given."""
-    shown = half.denoised if denoised is None else denoised
-    assert shown is not None
-    return Guides.of_half(
-        half.color,
-        shown,
-        margin=margin,
-        albedo=half.albedo,
-        normal=half.normal,
-        visibility=half.visibility,
-    )
 
 
 def _aovs(guarded: Guarded) -> dict[str, Tensor]:
     return {"blend": guarded.alpha, "error.before": guarded.errors[0], "error.after": guarded.errors[1]}
 
 
-def _finish(
-    frame: Frame, halves: tuple[Half, Half], network: Network, settings: Settings, scale: float
-) -> tuple[Tensor, Guarded | None]:
+def _finish(frame: Frame, network: Network, settings: Settings, scale: float) -> tuple[Tensor, Guarded | None]:
     """The result from the trained network, in the frame's own units."""
-    assert frame.denoised is not None
-    assert halves[0].denoised is not None
-    assert halves[1].denoised is not None
-    denoised = (halves[0].denoised, halves[1].denoised)
-    given = frame.denoised_full
-    full = mean(denoised) if given is None else _bounded(given, scale)
+    assert frame.denoised is not None  # correct() has checked; tells the type checker
+    given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
+    color = (_bounded(frame.color[0], scale), _bounded(frame.color[1], scale))
+    denoised = (_bounded(frame.denoised[0], scale), _bounded(frame.denoised[1], scale))
+    full = _bounded(given, scale)
 
-    def infer(shown: Tensor | None) -> tuple[Tensor, Tensor]:
-        return _infer(network, halves[0], shown, settings), _infer(network, halves[1], shown, settings)
+    def corrected(shown: Tensor | None) -> tuple[Tensor, Tensor]:
+        a, b = (infer(network, half, settings, scale=scale, denoised=shown) for half in frame.halves)
+        return a, b
 
-    with_halves = infer(None)
+    with_halves = corrected(None)
     image = mean(with_halves)
     if settings.inference == "full":
-        image += trust_in_full(denoised, full).to(image.dtype) * (mean(infer(full)) - image)
+        image += trust_in_full(denoised, full).to(image.dtype) * (mean(corrected(given)) - image)
     image = image.clamp(min=0)
     if not settings.guard:
         return _unscaled(image, scale), None
-    color = (halves[0].color, halves[1].color)
     guarded = guard(color, denoised, with_halves, full, image, scale=scale)
     if not guarded.estimate.improved:
-        return (mean(frame.denoised) if given is None else given), guarded
+        return given, guarded
     return _unscaled(keep_light(guarded.image, full, color), scale), guarded
 
 
 def _unscaled(image: Tensor, scale: float) -> Tensor:
     return (image.double() / scale).clamp(0, torch.finfo(torch.float32).max).float()
-
-
-@torch.no_grad()
-def _infer(network: Network, half: Half, shown: Tensor | None, settings: Settings) -> Tensor:
-    """The corrected half, (H, W, 3), on the whole image at once."""
-    guides = _guides(half, settings.window // 2, shown)
-    origin = torch.zeros(1, 2, dtype=torch.int64)
-    raw = network(guides.views(origin, (guides.height, guides.width)))
-    g = cross_bilateral(
-        guides,
-        raw,
-        origin,
-        window=settings.window,
-        combination=settings.combination,
-        threads=torch.get_num_threads(),
-    )
-    return g[0].permute(1, 2, 0)

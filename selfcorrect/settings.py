@@ -92,6 +92,9 @@ class Settings:
     crossed_weights: bool = _setting(
         False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
+    time_budget: float = _setting(
+        0.0, "seconds for the whole frame: training takes what else needs not; 0 sets none", "the user's"
+    )
     seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
 
     def __post_init__(self) -> None:

@@ -1,7 +1,10 @@
 """The optimiser's loop on one frame."""
 
+import copy
 import math
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,12 +15,28 @@ from selfcorrect.network import Network
 from selfcorrect.patches import batches, steps_count
 from selfcorrect.settings import Settings
 
-__all__ = ["Progress", "starting_losses", "train"]
+__all__ = ["Limits", "Progress", "starting_losses", "train"]
 
 Progress = Callable[[int, int, float], None]
 
 _WARM_UP = 20  # steps over which the cosine schedule reaches its rate
+_SHORTEST_ROUND = 0.5  # of the time that the steps took before: less is not worth beginning again for
+_LEAST_GAIN = 0.001  # of Eq. 8, most of which is noise that no network can take away
 _SAMPLE = 4  # rows and columns of patches that tell how well a network starts
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When training ends before its steps are done, and whether it goes on after them.
+
+    Attributes:
+        seconds: for training; 0 or less leaves the network as it is. Where there is time left after the settings'
+            steps, they are taken again, as long as Eq. 8 says that something is gained.
+        stop: asked before each step; training ends when it says True.
+    """
+
+    seconds: float = math.inf
+    stop: Callable[[], bool] = lambda: False
 
 
 def train(
@@ -26,26 +45,58 @@ def train(
     settings: Settings,
     generator: torch.Generator,
     progress: Progress | None = None,
+    limits: Limits | None = None,
 ) -> list[float]:
     """Optimise ``network`` in place on the halves' guides.
 
     Returns:
         Eq. 8 before each step. A step whose loss or gradient is not finite is not taken.
     """
+    limits = limits or Limits()
+    end = time.perf_counter() + limits.seconds
+    losses = _round(network, guides, settings, generator, progress, limits.stop, end)
+    while math.isfinite(end) and settings.steps and not limits.stop():
+        left = end - time.perf_counter()
+        if left < _SHORTEST_ROUND * (limits.seconds - left):
+            break
+        before, known = copy.deepcopy(network.state_dict()), starting_losses(network, guides, settings)
+        losses += _round(network, guides, settings, generator, progress, limits.stop, end)
+        gain = known - starting_losses(network, guides, settings)
+        if float(gain.mean()) < 0:
+            network.load_state_dict(before)
+        if float(gain.mean()) <= _LEAST_GAIN * float(known.mean()):
+            break
+    return losses
+
+
+def _round(
+    network: Network,
+    guides: tuple[Guides, Guides],
+    settings: Settings,
+    generator: torch.Generator,
+    progress: Progress | None,
+    stop: Callable[[], bool],
+    end: float,
+) -> list[float]:
+    """The settings' steps, or as many as there is time for; the schedule's end is reached in either case."""
     weights = _weights(guides, settings)
     size = (settings.patch, settings.patch)
     optimiser = torch.optim.Adam(network.parameters(), eps=settings.adam_epsilon, fused=True)
     rate = learning_rate(guides, settings)
     steps = steps_count((guides[0].height, guides[0].width), settings)
     losses: list[float] = []
-    for corners in batches((guides[0].height, guides[0].width), settings, generator):
+    began = time.perf_counter()
+    for corners in batches(guides[0], settings, generator):
+        done = max(len(losses) / steps, (time.perf_counter() - began) / max(end - began, 1e-9)) if steps else 1.0
+        if done >= 1 or stop():
+            break
         batch = [patch for half in guides for patch in half.views(corners, size)]
         loss = dual_buffer_loss(network(batch), corners, guides, weights, settings)
         optimiser.zero_grad()
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_limit or math.inf)
         for group in optimiser.param_groups:
-            group["lr"] = rate * _schedule(len(losses), steps, settings)
+            group["lr"] = rate * _schedule(len(losses), done, settings)
         if bool(norm.isfinite()) and bool(loss.isfinite()):
             optimiser.step()
         losses.append(float(loss.detach()))
@@ -63,10 +114,14 @@ def starting_losses(network: Network, guides: tuple[Guides, Guides], settings: S
     whole = guides[0].height, guides[0].width
     size = (min(settings.patch, whole[0]), min(settings.patch, whole[1]))
     starts = [torch.linspace(0, whole[i] - size[i], _SAMPLE).long().unique() for i in (0, 1)]
+    corners = torch.cartesian_prod(*starts)
+    if guides[0].stacked > 1:
+        first = guides[0].pitch * torch.linspace(0, guides[0].stacked - 1, _SAMPLE**2).long().unique()
+        corners = torch.stack([first, torch.zeros_like(first)], 1)
     weights = _weights(guides, settings)
     losses = []
-    for corner in torch.cartesian_prod(*starts).split(1):  # one at a time: less memory than a training step
-        raw = network(torch.cat([half.patches(corner, size) for half in guides]))
+    for corner in corners.split(1):  # one at a time: less memory than a training step
+        raw = network([patch for half in guides for patch in half.views(corner, size)])
         losses.append(dual_buffer_loss(raw, corner, guides, weights, settings).double())
     return torch.stack(losses)
 
@@ -77,8 +132,8 @@ def _weights(guides: tuple[Guides, Guides], settings: Settings) -> tuple[Tensor,
     return (b, a) if settings.crossed_weights else (a, b)
 
 
-def _schedule(step: int, steps: int, settings: Settings) -> float:
-    """Factor of the rate: constant, or half a cosine after a linear warm-up."""
+def _schedule(step: int, done: float, settings: Settings) -> float:
+    """Factor of the rate: constant, or half a cosine over the part ``done`` of the way, after a linear warm-up."""
     if settings.schedule == "constant":
         return 1.0
-    return min(1.0, (step + 1) / _WARM_UP) * (1 + math.cos(math.pi * step / steps)) / 2
+    return min(1.0, (step + 1) / _WARM_UP) * (1 + math.cos(math.pi * done)) / 2

@@ -42,7 +42,8 @@ def _validate(guides: Guides, raw: Tensor, corners: Tensor, window: int, every: 
     if raw.dtype != guides.planes.dtype:
         raise FrameError(f"expected raw heads in {guides.planes.dtype}, but got {raw.dtype}")
     reach = guides.margin - window // 2
-    last = corners + torch.tensor([raw.shape[2] - guides.height, raw.shape[3] - guides.width])
+    bottom = (guides.stacked - 1) * guides.pitch + guides.height
+    last = corners + torch.tensor([raw.shape[2] - bottom, raw.shape[3] - guides.width])
     if corners.numel() and (corners.min() < -reach or last.max() > reach):
         raise FrameError(f"expected patches at most {reach} pixels outside the image (margin {guides.margin})")
 

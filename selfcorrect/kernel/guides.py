@@ -1,6 +1,6 @@
 """What the kernel reads: the guide buffers of one half, padded once, so that no border is left to handle."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,6 +29,9 @@ class Guides:
 
     ``planes`` is (C, H + 2·margin, W + 2·margin + slack) with the channels in the order of the paper's network
     input: y(3), albedo(3), visibility(1), normal(3), z(3). A buffer that the frame does not have has no plane.
+
+    Guides of ``stacked`` crops of one size lie below one another, each with margins of its own: then height and width
+    are those of a crop, and the first row of the next one is ``pitch`` rows further on.
     """
 
     planes: Tensor
@@ -38,6 +41,7 @@ class Guides:
     has_albedo: bool
     has_normal: bool
     has_visibility: bool
+    stacked: int = 1
 
     @classmethod
     def of_half(
@@ -49,15 +53,39 @@ class Guides:
         albedo: Tensor | None = None,
         normal: Tensor | None = None,
         visibility: Tensor | None = None,
+        scale: float = 1.0,
+        region: tuple[int, int, int, int] | None = None,
     ) -> "Guides":
-        """Pad the (H, W, C) buffers of one half by ``margin`` ≥ window // 2 pixels; bounds them by ±1e15."""
-        height, width, _ = color.shape
-        given = [b for b in (color, albedo, visibility, normal, denoised) if b is not None]
-        stacked = torch.cat([b.permute(2, 0, 1) for b in given]).clamp(-LARGEST, LARGEST)
-        rows = mirror(-margin, height + margin, height).to(color.device)
-        columns = mirror(-margin, width + margin + _LANES, width).to(color.device)
-        planes = stacked.index_select(1, rows).index_select(2, columns).contiguous()
-        return cls(planes, height, width, margin, albedo is not None, normal is not None, visibility is not None)
+        """Guides of one half from its (H, W, C) buffers, bounded by ±1e15.
+
+        Args:
+            color, denoised, albedo, normal, visibility: the buffers.
+            margin: pixels around, at least window // 2; beyond the image's border they are its mirror image.
+            scale: what radiance is multiplied by.
+            region: top, left, bottom, right of the pixels wanted, by default all.
+        """
+        top, left, bottom, right = region or (0, 0, *color.shape[:2])
+        rows = mirror(top - margin, bottom + margin, color.shape[0]).to(color.device)
+        columns = mirror(left - margin, right + margin + _LANES, color.shape[1]).to(color.device)
+
+        def cut(buffer: Tensor, factor: float = 1.0) -> Tensor:
+            part = buffer.index_select(0, rows).index_select(1, columns).permute(2, 0, 1)
+            return (part.double() * factor).clamp(-LARGEST, LARGEST).float() if factor != 1.0 else part
+
+        parts = [cut(color, scale), *(cut(b) for b in (albedo, visibility, normal) if b is not None)]
+        planes = torch.cat([*parts, cut(denoised, scale)]).clamp_(-LARGEST, LARGEST)
+        present = (albedo is not None, normal is not None, visibility is not None)
+        return cls(planes, bottom - top, right - left, margin, *present)
+
+    @classmethod
+    def stack(cls, crops: "list[Guides]") -> "Guides":
+        """Guides of one size, below one another."""
+        return replace(crops[0], planes=torch.cat([c.planes for c in crops], 1), stacked=len(crops))
+
+    @property
+    def pitch(self) -> int:
+        """Rows from one of the stacked crops to the next."""
+        return self.height + 2 * self.margin
 
     @property
     def betas(self) -> int:
@@ -71,7 +99,7 @@ class Guides:
 
     @property
     def inner(self) -> Tensor:
-        """All planes without their margin, (C, H, W)."""
+        """All planes without their margin, (C, H, W); of the first of stacked crops."""
         m = self.margin
         return self.planes[:, m : m + self.height, m : m + self.width]
 

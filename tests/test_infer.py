@@ -1,0 +1,147 @@
+"""Tiles: the same bits as the whole image; crops: large frames are trained on a bounded number of pixels."""
+
+import time
+
+import pytest
+import torch
+from torch import Tensor
+
+from selfcorrect import Frame, Settings, correct
+from selfcorrect.infer import infer, tiles
+from selfcorrect.kernel import Guides
+from selfcorrect.network import Network
+from selfcorrect.patches import batches, crops
+
+QUICK = Settings.preset("balanced", steps=4, window=7)
+
+
+def make_frame(height: int, width: int, seed: int = 0) -> Frame:
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(channels: int = 3) -> Tensor:
+        return torch.rand(height, width, channels, generator=generator)
+
+    rows = torch.linspace(0, 6, height).sin()[:, None, None].expand(height, width, 3) + 1.5
+    albedo = noise()
+    return Frame(
+        (rows + noise(), rows + noise()),
+        denoised=(rows + 0.1 * noise(), rows + 0.1 * noise()),
+        albedo=(albedo, albedo),
+        denoised_full=rows + 0.05 * noise(),
+    )
+
+
+def make_network(frame: Frame, settings: Settings) -> Network:
+    half = frame.halves[0]
+    guides = Guides.of_half(half.color, half.denoised, margin=9, albedo=half.albedo)
+    return Network.for_guides(guides, settings, torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("side", [16, 37])
+def test_tiles_give_the_bits_of_the_whole_image(side: int, precision: str) -> None:
+    frame = make_frame(61, 83)
+    settings = Settings.preset("balanced", precision=precision)
+    network = make_network(frame, settings)
+    for denoised in (None, frame.denoised_full):
+        whole, tiled = (
+            infer(network, frame.halves[0], settings, scale=0.7, denoised=denoised, side=s) for s in (100, side)
+        )
+        assert torch.equal(whole, tiled)
+        assert whole.std() > 0.1
+
+
+def test_tiles_cover_every_pixel_once() -> None:
+    count = torch.zeros(70, 33)
+    for top, left, bottom, right in tiles((70, 33), 32):
+        count[top:bottom, left:right] += 1
+    assert count.eq(1).all()
+
+
+def test_a_region_of_the_guides_is_the_part_of_the_whole() -> None:
+    frame = make_frame(40, 50)
+    half = frame.halves[0]
+    whole = Guides.of_half(half.color, half.denoised, margin=12, scale=2.0)
+    part = Guides.of_half(half.color, half.denoised, margin=5, scale=2.0, region=(0, 30, 20, 50))
+    assert torch.equal(part.planes[:, :30, :30], whole.planes[:, 7:37, 37:67])
+
+
+def test_large_frames_are_trained_on_crops_spread_over_them() -> None:
+    generator = torch.Generator().manual_seed(0)
+    found = crops((2160, 3840), QUICK, generator)
+    assert 2**20 < len(found) * 128 * 128 <= 2**21
+    centres = torch.tensor([[(t + b) / 2 / 2160, (left + r) / 2 / 3840] for t, left, b, r in found])
+    assert centres.min() > 0
+    assert centres.max() < 1
+    counts = torch.histogramdd(centres.double(), bins=[2, 2], range=[0, 1, 0, 1]).hist
+    assert counts.min() > 0.2 * len(found)
+    assert not crops((1000, 1000), QUICK, generator), "whole: it has fewer pixels"
+    assert not crops((2160, 3840), Settings.preset("paper"), generator), "the paper takes all patches"
+
+
+def test_patches_of_crops_lie_inside_them() -> None:
+    frame = make_frame(60, 90)
+    half = frame.halves[0]
+    regions = [(0, 0, 40, 40), (20, 50, 60, 90), (10, 10, 50, 50)]
+    settings = Settings.preset("balanced", patch=16, steps=1)
+    guides = Guides.stack([Guides.of_half(half.color, half.denoised, margin=9, region=region) for region in regions])
+    seen = set()
+    for corners, _ in zip(batches(guides, settings, torch.Generator().manual_seed(0)), range(50), strict=False):
+        for row, column in corners.tolist():
+            crop, inside = divmod(row, guides.pitch)
+            seen.add(crop)
+            assert 0 <= inside <= 24
+            assert 0 <= column <= 24
+            top, left, _, _ = regions[crop]
+            patch = guides.patches(torch.tensor([[row, column]]), (16, 16))[0, :3]
+            expected = half.color[top + inside : top + inside + 16, left + column : left + column + 16]
+            assert torch.equal(patch, expected.permute(2, 0, 1))
+    assert seen == {0, 1, 2}
+
+
+def test_a_frame_on_crops_is_corrected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("selfcorrect.patches._MOST_PIXELS", 128 * 128 * 2)
+    frame = make_frame(150, 300)
+    cold = correct(frame, QUICK)
+    assert torch.isfinite(cold.image).all()
+    warm = correct(frame, QUICK, warm_start=cold.network)
+    assert warm.start.warm_loss is not None
+
+
+def test_stop_ends_training_and_still_gives_a_result() -> None:
+    steps = []
+    frame = make_frame(40, 50)
+    result = correct(
+        frame,
+        Settings.preset("balanced", steps=50, window=7),
+        progress=lambda step, *_: steps.append(step),
+        stop=lambda: len(steps) >= 3,
+    )
+    assert len(result.losses) == 3
+    assert torch.isfinite(result.image).all()
+
+
+def test_a_time_budget_is_kept() -> None:
+    frame = make_frame(100, 120)
+    correct(frame, Settings.preset("balanced", steps=2))  # libraries load at the first call
+    began = time.perf_counter()
+    result = correct(frame, Settings.preset("balanced", steps=100_000, time_budget=3.0))
+    seconds = time.perf_counter() - began
+    assert 1.5 < seconds < 4.0, "1 s more at most"
+    assert 0 < len(result.losses) < 100_000
+
+
+def test_time_left_is_used_as_long_as_it_gains() -> None:
+    frame = make_frame(64, 64)
+    settings = Settings.preset("balanced", steps=3, window=7, patch=32)
+    once = correct(frame, settings)
+    longer = correct(frame, Settings.preset("balanced", **(settings.to_dict() | {"time_budget": 2.0})))
+    assert len(longer.losses) % 3 == 0 or len(longer.losses) > 6
+    assert len(longer.losses) > len(once.losses)
+
+
+def test_no_time_for_training_gives_the_denoised_image() -> None:
+    frame = make_frame(40, 50)
+    result = correct(frame, Settings.preset("balanced", time_budget=1e-6))
+    assert result.losses == []
+    assert torch.isfinite(result.image).all()
