@@ -69,8 +69,11 @@ class Network(nn.Module):
         """Shapes of all weights: two networks with the same shape can be exchanged."""
         return [tuple(p.shape) for p in self.parameters()]
 
-    def forward(self, guides: Tensor | Sequence[Tensor]) -> Tensor:
-        """Guides, N of (C, h, w), to raw heads (N, heads, h, w); on the CPU as the compiled kernel computes them."""
+    def forward(self, guides: Tensor | Sequence[Tensor], region: tuple[int, int, int, int] | None = None) -> Tensor:
+        """Guides, N of (C, h, w), to raw heads (N, heads, h, w), or those of a region (top, left, bottom, right).
+
+        On the CPU by the compiled kernel, see :func:`selfcorrect.kernel.convolution.convolutions`.
+        """
         parameters = list(self.parameters())
         if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*guides, *parameters)) and (
             max(p.shape[0] for p in (guides[0], *parameters)) <= convolution.LARGEST_WIDTH
@@ -79,10 +82,13 @@ class Network(nn.Module):
                 list(guides),
                 parameters,
                 log_radiance=self.log_radiance,
+                region=region,
                 precision=self.precision,
                 threads=torch.get_num_threads(),
             )
-        return self.reference(guides if isinstance(guides, Tensor) else torch.stack(list(guides)))
+        raw = self.reference(guides if isinstance(guides, Tensor) else torch.stack(list(guides)))
+        top, left, bottom, right = region or (0, 0, *raw.shape[2:])
+        return raw[:, :, top:bottom, left:right]
 
     def reference(self, guides: Tensor) -> Tensor:
         """The same in plain torch: guides (N, C, h, w), any device and dtype."""
