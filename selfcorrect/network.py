@@ -124,9 +124,9 @@ class Network(nn.Module):
             last.bias.copy_(torch.tensor([*betas, *(math.log(math.expm1(value)) for value in (*gammas, _START_TAU))]))
 
     def forward(self, guides: Tensor | Sequence[Tensor], region: tuple[int, int, int, int] | None = None) -> Tensor:
-        """Guides, N of (C, h, w), to raw heads (N, heads, h, w); on the CPU as the compiled kernel computes them.
+        """Guides, N of (C, h, w), to raw heads (N, heads, h, w), or those of a region (top, left, bottom, right).
 
-        ``region`` (top, left, bottom, right) is the part whose heads are wanted, by default all.
+        On the CPU by the compiled kernel, see :func:`selfcorrect.kernel.convolution.convolutions`.
         """
         parameters = list(self.parameters())
         if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*guides, *parameters)) and (

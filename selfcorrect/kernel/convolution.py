@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from selfcorrect.errors import FrameError
 from selfcorrect.kernel import _cpu
 
 __all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "instruction_sets", "peak"]
@@ -84,13 +85,22 @@ def convolutions(
 
     Returns:
         Raw heads (N, heads, height, width of the region).
+
+    Raises:
+        FrameError: the region reaches beyond the images, or gradients are wanted of it.
     """
     _, height, width = images[0].shape
-    views = [image if image.stride(2) == 1 else image.contiguous() for image in images]
     train = torch.is_grad_enabled() and any(p.requires_grad for p in parameters)
+    top, left, bottom, right = whole = (0, 0, height, width)
+    if region is not None and region != whole:
+        top, left, bottom, right = region
+        if train or not (0 <= top < bottom <= height and 0 <= left < right <= width):
+            expected = "the whole image (gradients are wanted)" if train else f"a region inside {whole}"
+            raise FrameError(f"expected {expected}, but got the region {region}")
+    views = [image if image.stride(2) == 1 else image.contiguous() for image in images]
     result: Tensor = _Convolutions.apply(  # type: ignore[no-untyped-call]  # torch's
         views,
-        list(region or (0, 0, height, width)),
+        [top, left, bottom, right],
         train,
         log_radiance,
         threads,
