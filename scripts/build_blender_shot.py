@@ -2,9 +2,10 @@
 
     python scripts/build_blender_shot.py shot.blend
 
-Runs with Blender as a Python module (`pip install bpy`) or as `blender -b --python scripts/build_blender_shot.py -- FILE`.
-Everything is procedural: noisy because of a small lamp behind a lattice and glossy spheres, detailed because of bricks,
-checks and bump. 240×135 pixels, 32 samples.
+Runs with Blender as a Python module (`pip install bpy`) or as
+`blender -b --python scripts/build_blender_shot.py -- FILE`; everything is procedural.
+Noisy because of a small lamp behind a lattice and glossy spheres, detailed because of bricks, checks and bump; 240×135
+pixels, 32 samples.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What the render scripts share: frame ranges, seeds and file names. Standard library only: Blender's Python has no more.
+"""What the render scripts share: frame ranges, seeds and file names. Blender's Python has the standard library only.
 
 A shot is ``NAME_a.####.exr`` and ``NAME_b.####.exr``, what ``selfcorrect sequence`` reads; a single frame is
 ``NAME_a.exr`` and ``NAME_b.exr``.
@@ -23,10 +23,12 @@ def parse_frames(text: str) -> list[int]:
     """
     frames: set[int] = set()
     for item in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?:[x:](\d+))?)?\s*", item)
+        match = re.fullmatch(r"\s*(-?\d+)(?:-(-?\d+)(?:[x:](\d+))?)?\s*", item)
         first, last, step = (None, None, None) if match is None else match.groups()
         if first is None or int(last or first) < int(first) or int(step or 1) < 1:
-            raise argparse.ArgumentTypeError(f"expected frames such as 1-240, 1-240x2 or 1-3,5,7-20:2, but got {text!r}")
+            raise argparse.ArgumentTypeError(
+                f"expected frames such as 1-240, 1-240x2 or 1-3,5,7-20:2, but got {text!r}"
+            )
         frames.update(range(int(first), int(last or first) + 1, int(step or 1)))
     return sorted(frames)
 
@@ -83,7 +85,9 @@ def published(path: Path) -> Iterator[Path]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The flags that all render scripts have."""
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the halves")
-    parser.add_argument("--spp", type=even, required=True, metavar="N", help="samples per pixel of both halves together")
+    parser.add_argument(
+        "--spp", type=even, required=True, metavar="N", help="samples per pixel of both halves together"
+    )
     parser.add_argument("--frames", type=parse_frames, metavar="1-24", help="1-240, 1-240x2, 1-3,5,7-20:2")
     parser.add_argument("--size", type=size, metavar="WxH", help="by default the scene's own")
     parser.add_argument("--name", help="the file names begin with it (default: the scene file's name)")

@@ -5,9 +5,9 @@ With Blender, or with Blender as a Python module (`pip install bpy`)::
     blender -b FILE.blend --python-exit-code 1 --python scripts/render_blender.py -- -o shot --spp 128 --frames 1-24
     python scripts/render_blender.py FILE.blend -o shot --spp 128 --frames 1-24
 
-It writes ``FILE_a.####.exr`` and ``FILE_b.####.exr``, multilayer EXR, float, with every pass that the view layers have on
-and the denoising passes (albedo, normal, depth) besides. Each half has half of the samples and a seed of its own. What is
-changed for the render, and only for it (the file is never saved):
+It writes ``FILE_a.####.exr`` and ``FILE_b.####.exr``, multilayer EXR, float, with every pass that the view layers have
+on and the denoising passes (albedo, normal, depth) besides. Each half has half of the samples and a seed of its own.
+What is changed for the render, and only for it (the file is never saved):
 
 - denoiser off, since selfcorrect denoises each half itself;
 - pixel filter: box, since a wider one correlates the noise of neighbours;

@@ -3,13 +3,13 @@
     python scripts/render_mitsuba.py SCENE.xml -o shot --spp 64
     python scripts/render_mitsuba.py SCENE.xml -o shot --spp 64 --frames 1-24 --size 480x270 -D 'angle={2 * frame}'
 
-It writes ``SCENE_a.####.exr`` and ``SCENE_b.####.exr``, half of the samples and another seed each, with albedo, shading
-normal and depth beside the colour. The scene's integrator, sampler and camera stay; its pixel filter becomes a box, since
-a wider one correlates the noise of neighbours, and a film that names no component format stores float.
+It writes ``SCENE_a.####.exr`` and ``SCENE_b.####.exr``, half of the samples and another seed each, with albedo,
+shading normal and depth beside the colour. The scene's integrator, sampler and camera stay; its pixel filter becomes a
+box, since a wider one correlates the noise of neighbours, and a film that names no component format stores float.
 
-``-D NAME=TEXT`` sets a parameter of the scene (``<default name="NAME" value="…"/>``, used as ``$NAME``). Between braces in
-TEXT stands arithmetic over the frame number: ``{1.5 + sin(frame / 24)}``, ``wood.{frame:04d}.png``. A scene that declares
-``$frame`` gets the frame number without being asked.
+``-D NAME=TEXT`` sets a parameter of the scene (``<default name="NAME" value="…"/>``, used as ``$NAME``). Between braces
+in TEXT stands arithmetic over the frame number: ``{1.5 + sin(frame / 24)}``, ``wood.{frame:04d}.png``. A scene that
+uses ``$frame`` gets the frame number without being asked.
 
 Needs the extra `render`; the LLVM variants also need the LLVM shared library (`apt-get install libllvm19`, and the
 variable DRJIT_LIBLLVM_PATH where it is not found), and without it `--variant scalar_rgb` does the same, more slowly.
@@ -31,7 +31,7 @@ from halves import HALVES, add_arguments, path_of, published, seed_of
 
 AOVS = "albedo:albedo,nn:sh_normal,dd:depth"
 PATHS_PER_PASS = 2**23
-"""What the LLVM variants hold in memory at once; more samples are rendered in passes. About 2 GB in a plain room."""
+"""More samples are rendered in several passes: the LLVM and CUDA variants hold all paths of one in memory."""
 
 _OPERATORS = {
     ast.Add: operator.add,
@@ -146,7 +146,7 @@ def render(scene: Any, spp: int, seed: int, integrator: Any = None) -> Any:
     beauty = integrator or scene.integrator() or mi.load_dict({"type": "path"})
     aov = mi.load_dict({"type": "aov", "aovs": AOVS, "beauty": beauty})
     width, height = sensor.film().crop_size()
-    most = spp if mi.variant().startswith("scalar") else max(1, PATHS_PER_PASS // (width * height))
+    most = max(1, PATHS_PER_PASS // (width * height))
     passes = np.diff(np.linspace(0, spp, math.ceil(spp / most) + 1).round().astype(int))
     total: Any = 0
     for number, samples in enumerate(passes):
@@ -187,7 +187,10 @@ def render_shot(options: argparse.Namespace) -> None:
 def main() -> int:
     options = arguments()
     if options.variant not in mi.variants():
-        print(f"render_mitsuba: error: expected a variant of {mi.variants()}, but got {options.variant!r}", file=sys.stderr)
+        print(
+            f"render_mitsuba: error: expected a variant of {mi.variants()}, but got {options.variant!r}",
+            file=sys.stderr,
+        )
         return 2
     try:
         mi.set_variant(options.variant)

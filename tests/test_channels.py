@@ -337,7 +337,9 @@ def test_views_in_one_part():
             "color": three(f"{view}.L.Combined"),
             "albedo": three(f"{view}.L.Denoising Albedo"),
         }
-    (full,) = channels.full_names([("", [*"RGB", "right.R", "right.G", "right.B", "N.X", "N.right.X"])], ["left", "right"])
+    (full,) = channels.full_names(
+        [("", [*"RGB", "right.R", "right.G", "right.B", "N.X", "N.right.X"])], ["left", "right"]
+    )
     assert full == [*"RGB", "right.R", "right.G", "right.B", "N.X", "right.N.X"]
 
 
