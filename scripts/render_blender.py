@@ -112,7 +112,8 @@ def render_shot(options: argparse.Namespace) -> None:
     """Write both halves of every frame."""
     if options.file is not None:
         bpy.ops.wm.open_mainfile(filepath=str(options.file.resolve()))
-    scene = bpy.context.scene
+    scene = _scene(options.scene_name)
+    bpy.app.handlers.render_stats.append(_print_samples)
     prepare(scene, options.spp // 2, options.size)
     name = options.name or Path(bpy.data.filepath).stem or "untitled"
     for frame in options.frames or [None]:
@@ -124,10 +125,23 @@ def render_shot(options: argparse.Namespace) -> None:
             print(f"{path}: {options.spp // 2} spp, {time.perf_counter() - started:.1f} s", flush=True)
 
 
+def _scene(name: str | None) -> bpy.types.Scene:
+    if name is not None and name not in bpy.data.scenes:
+        raise RenderError(f"expected a scene of {', '.join(bpy.data.scenes.keys())}, but got '{name}'")
+    return bpy.context.scene if name is None else bpy.data.scenes[name]
+
+
+def _print_samples(stats: str, *_: object) -> None:
+    """Progress for who reads the output: "Sample 3/16"."""
+    if "Sample" in stats:
+        print(stats, flush=True)
+
+
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Render the two halves of a frame or a shot with Blender's Cycles.")
     parser.add_argument("file", type=Path, nargs="?", metavar="FILE.blend", help="left out where Blender has opened it")
     add_arguments(parser)
+    parser.add_argument("--scene-name", metavar="SCENE", help="by default the one that was open when it was saved")
     own = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     return parser.parse_args(own)
 
