@@ -113,7 +113,6 @@ def render_shot(options: argparse.Namespace) -> None:
     if options.file is not None:
         bpy.ops.wm.open_mainfile(filepath=str(options.file.resolve()))
     scene = _scene(options.scene_name)
-    bpy.app.handlers.render_stats.append(_print_samples)
     prepare(scene, options.spp // 2, options.size)
     name = options.name or Path(bpy.data.filepath).stem or "untitled"
     for frame in options.frames or [None]:
@@ -131,6 +130,7 @@ def _scene(name: str | None) -> bpy.types.Scene:
     return bpy.context.scene if name is None else bpy.data.scenes[name]
 
 
+@bpy.app.handlers.persistent  # stays when the file is opened
 def _print_samples(stats: str, *_: object) -> None:
     """Progress for who reads the output: "Sample 3/16"."""
     if "Sample" in stats:
@@ -147,11 +147,15 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
+    bpy.app.handlers.render_stats.append(_print_samples)
     try:
         render_shot(arguments())
     except (RenderError, RuntimeError, OSError) as error:  # RuntimeError: what Blender's operators raise
         print(f"render_blender: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    finally:
+        # Blender 4.2 as a module crashes at its end with a handler left
+        bpy.app.handlers.render_stats.remove(_print_samples)
     return 0
 
 

@@ -8,6 +8,7 @@ import json
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import bpy
@@ -74,6 +75,54 @@ def drawn():
     return recorder.texts
 
 
+class Operator:
+    """Stands for the operator, which Blender makes only for its event loop, which needs a window; the methods are real."""
+
+    def __init__(self):
+        real = vars(sys.modules[MODULE].SELFCORRECT_OT_render)
+        for name in ("invoke", "modal", "_begin", "_end", "_failed", "_clean"):
+            setattr(self, name, types.MethodType(real[name], self))
+        self.animation, self.reports, self.timers = False, [], 0
+
+    def report(self, kind, message):
+        self.reports.append(message)
+
+    def event_timer_add(self, interval, window):
+        self.timers += 1
+        return "timer"
+
+    def event_timer_remove(self, timer):
+        self.timers -= timer == "timer"
+
+
+def in_the_event_loop(cancel):
+    """Start as the button does, then one timer event after the other; what all came to."""
+    operator = Operator()
+    manager = types.SimpleNamespace(
+        event_timer_add=operator.event_timer_add,
+        event_timer_remove=operator.event_timer_remove,
+        modal_handler_add=lambda operator: None,
+        windows=[],
+    )
+    context = types.SimpleNamespace(
+        scene=bpy.context.scene, preferences=bpy.context.preferences, window=None, window_manager=manager
+    )
+    tick, mouse = types.SimpleNamespace(type="TIMER"), types.SimpleNamespace(type="MOUSEMOVE")
+    answers = [operator.invoke(context, None), operator.modal(context, mouse)]
+    seen = [drawn()]
+    while (answer := operator.modal(context, tick)) == {"PASS_THROUGH"}:
+        if cancel and sys.modules[MODULE].State.job.label:
+            bpy.ops.selfcorrect.cancel()
+        time.sleep(0.1)
+    answers.append(answer)
+    return {
+        "answers": [*map(sorted, answers)],
+        "reports": operator.reports,
+        "timers": operator.timers,
+        "drawn": seen[0],
+    }
+
+
 def cancelled():
     """A render that is stopped in the middle: what it says, and whether its process is gone."""
     extension, scene = sys.modules[MODULE], bpy.context.scene
@@ -105,7 +154,8 @@ def main():
     len(image.pixels)  # loads it
     found["image"] = {"path": image.filepath, "type": image.type}
     found["images"] = len(bpy.data.images)
-    found["again"], found["images again"] = attempt(), len(bpy.data.images)
+    found["again"], found["images again"] = in_the_event_loop(cancel=False), len(bpy.data.images)
+    found["cancelled again"] = in_the_event_loop(cancel=True)
     scene.selfcorrect.denoiser = "nonsense"
     found["failing"], found["settings after failing"] = attempt(), settings()
     scene.selfcorrect.denoiser = ""

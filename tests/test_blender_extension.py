@@ -79,8 +79,6 @@ def test_a_frame_is_rendered_corrected_and_loaded(found: dict[str, Any]) -> None
     assert half.buffers["color"].shape == (24, 40, 3)
     assert "selfcorrect/settings" in half.file.parts[0].header
     assert half.file.parts[0].header["cycles.ViewLayer.samples"] == "2"
-    assert found["again"] == ["FINISHED"]
-    assert found["images again"] == found["images"]
 
 
 @pytest.mark.blender
@@ -109,6 +107,18 @@ def test_cancelling_ends_the_process(found: dict[str, Any]) -> None:
     assert 0 < found["cancelled"]["progress"] < 0.6
     assert found["cancelled"]["returncode"] not in {0, None}
     assert found["cancelled"]["polls"] is False
+
+
+@pytest.mark.blender
+def test_the_button_leaves_blender_to_the_user_meanwhile(found: dict[str, Any]) -> None:
+    again, cancelled = found["again"], found["cancelled again"]
+    assert again["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["FINISHED"]]
+    assert again["reports"] == [f"room.0001.exr in {found['folder'] / 'out'}"]
+    assert cancelled["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["CANCELLED"]]
+    assert cancelled["reports"] == ["cancelled"]
+    assert again["timers"] == cancelled["timers"] == 0
+    assert "selfcorrect.cancel" in again["drawn"]
+    assert found["images again"] == found["images"]
 
 
 @pytest.mark.blender
