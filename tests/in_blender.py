@@ -76,7 +76,7 @@ def drawn():
 
 
 class Operator:
-    """Stands for the operator, which Blender makes only for its event loop, which needs a window; the methods are real."""
+    """Stands for the operator, which only the event loop of a window makes; its methods are the real ones."""
 
     def __init__(self):
         real = vars(sys.modules[MODULE].SELFCORRECT_OT_render)
