@@ -16,12 +16,12 @@ HALVES = ("a", "b")
 
 
 def parse_frames(text: str) -> list[int]:
-    """Frames of a range: ``1-240``, ``1-240x2``, ``1-3,5,7-20:2``, ``5-5``; sorted, each once.
+    """Frames of a range: ``1-240``, ``1-240x2``, ``1-3,5,7-20:2``, ``5-5``; in its order, each once.
 
     Raises:
         argparse.ArgumentTypeError: it is no range.
     """
-    frames: set[int] = set()
+    frames: dict[int, None] = {}
     for item in text.split(","):
         match = re.fullmatch(r"\s*(-?\d+)(?:-(-?\d+)(?:[x:](\d+))?)?\s*", item)
         first, last, step = (None, None, None) if match is None else match.groups()
@@ -29,8 +29,8 @@ def parse_frames(text: str) -> list[int]:
             raise argparse.ArgumentTypeError(
                 f"expected frames such as 1-240, 1-240x2 or 1-3,5,7-20:2, but got {text!r}"
             )
-        frames.update(range(int(first), int(last or first) + 1, int(step or 1)))
-    return sorted(frames)
+        frames |= dict.fromkeys(range(int(first), int(last or first) + 1, int(step or 1)))
+    return list(frames)
 
 
 def even(text: str) -> int:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from test_exr import assert_passed_through, rewrite, three
 
-from selfcorrect import exr, files
+from selfcorrect import exr, files, framerange
+from selfcorrect.errors import SettingsError
 from selfcorrect.independence import doubts
 
 SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
@@ -67,17 +68,24 @@ class TestHalves:
             ("5-5", [5]),
             ("1-4", [1, 2, 3, 4]),
             ("1-7x3", [1, 4, 7]),
-            ("7-20:5, 1-3,2", [1, 2, 3, 7, 12, 17]),
+            ("7-20:5, 1-3,2", [7, 12, 17, 1, 2, 3]),
             ("-2-0", [-2, -1, 0]),
         ],
     )
     def test_frames(self, text: str, frames: list[int]) -> None:
-        assert halves.parse_frames(text) == frames
+        assert halves.parse_frames(text) == framerange.parse_frames(text) == frames  # the other one is the command's
 
     @pytest.mark.parametrize("text", ["", "a", "4-1", "1-", "1-4x0", "1..4", "1,,2"])
     def test_no_frames(self, text: str) -> None:
         with pytest.raises(argparse.ArgumentTypeError, match="expected frames such as"):
             halves.parse_frames(text)
+        with pytest.raises(SettingsError):
+            framerange.parse_frames(text)
+
+    @pytest.mark.parametrize("frame", [None, 7, -7, 12345])
+    def test_names(self, frame: int | None) -> None:
+        path = halves.path_of(Path("shot"), "room", "b", frame)
+        assert str(path) == ("shot/room_b.exr" if frame is None else framerange.fill("shot/room_b.####.exr", frame))
 
     def test_no_seed_comes_twice(self) -> None:
         seeds = [halves.seed_of(s, frame, half) for s in range(4) for frame in range(250) for half in "ab"]
