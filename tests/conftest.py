@@ -9,7 +9,10 @@ import pytest
 import torch
 
 HAS_BLENDER = sys.version_info[:2] == (3, 11) and platform.machine() != "aarch64"
-"""Where the package bpy has a wheel, the tests demand it; see the extra `blender` in pyproject.toml."""
+"""Where the package bpy has a wheel, the tests demand it."""
+
+BLENDER = Path(__file__).resolve().parent.parent / ".venv-blender" / "bin" / "python"
+"""The Python that has it; `sh scripts/setup-blender` makes it."""
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(mode=True)

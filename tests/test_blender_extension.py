@@ -1,6 +1,5 @@
 """The Blender extension: built, installed and used in a real Blender without a window."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -11,6 +10,7 @@ from typing import Any
 
 import build_blender_extension
 import pytest
+from conftest import BLENDER
 from test_cli import BALANCED
 from test_render_scripts import BLENDER_TAKEN, done
 
@@ -33,11 +33,8 @@ def test_the_zip_holds_what_it_needs_and_the_same_bytes_again(archive: Path, tmp
 
 @pytest.mark.blender
 def test_blender_takes_the_zip_for_valid(archive: Path) -> None:
-    spec = importlib.util.find_spec("bpy")
-    assert spec is not None
-    assert spec.origin is not None
-    (tool,) = Path(spec.origin).parent.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py")
-    result = subprocess.run([sys.executable, tool, "validate", archive], capture_output=True, text=True, check=False)
+    (tool,) = BLENDER.parent.parent.glob("lib/*/site-packages/bpy/*/scripts/addons_core/bl_pkg/cli/blender_ext.py")
+    result = subprocess.run([BLENDER, tool, "validate", archive], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
     assert "No errors" in result.stdout or "Success" in result.stdout, result.stdout
 
@@ -54,11 +51,11 @@ def found(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     command.chmod(0o755)
     small = "import bpy; bpy.ops.wm.open_mainfile(filepath={0!r}); r = bpy.context.scene.render; "
     small += "r.resolution_x, r.resolution_y = 40, 24; bpy.ops.wm.save_mainfile()"
-    subprocess.run([sys.executable, "-c", small.format(str(folder / "room.blend"))], check=True, capture_output=True)
+    subprocess.run([BLENDER, "-c", small.format(str(folder / "room.blend"))], check=True, capture_output=True)
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / "user"), "TMPDIR": str(folder / "scratch")}
     arguments = [archive, folder / "room.blend", command, folder / "out"]
     result = subprocess.run(
-        [sys.executable, str(HERE / "in_blender.py"), *map(str, arguments)],
+        [str(BLENDER), str(HERE / "in_blender.py"), *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,

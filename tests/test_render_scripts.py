@@ -11,6 +11,7 @@ from typing import Any
 import halves
 import numpy as np
 import pytest
+from conftest import BLENDER
 from test_exr import assert_passed_through, rewrite, three
 
 from selfcorrect import exr, files, framerange
@@ -21,7 +22,8 @@ SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
 
 
 def script(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(SCRIPTS / f"{name}.py"), *map(str, arguments)]
+    python = BLENDER if "blender" in name else sys.executable
+    command = [str(python), str(SCRIPTS / f"{name}.py"), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
 
 
@@ -228,7 +230,7 @@ def changed(blend: Path, code: str) -> Path:
     copy = blend.with_name("changed.blend")
     lines = f"import bpy\nbpy.ops.wm.open_mainfile(filepath={str(blend)!r})\nscene = bpy.context.scene\n{code}\n"
     lines += f"bpy.ops.wm.save_as_mainfile(filepath={str(copy)!r})"
-    subprocess.run([sys.executable, "-c", lines], check=True, capture_output=True, timeout=300)
+    subprocess.run([BLENDER, "-c", lines], check=True, capture_output=True, timeout=300)
     return copy
 
 
