@@ -1,6 +1,6 @@
 """Runs inside Blender (bpy) for test_blender_extension.py: installs the extension as a user does and tries everything.
 
-usage: in_blender.py EXTENSION.zip FILE.blend SELFCORRECT FOLDER; prints one JSON object as its last line.
+usage: in_blender.py EXTENSION.zip FILE.blend SELFCORRECT BLENDER FOLDER; prints one JSON object as its last line.
 """
 
 import gc
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import bpy
 
-ARCHIVE, BLEND, COMMAND, FOLDER = sys.argv[1:]
+ARCHIVE, BLEND, COMMAND, PROGRAM, FOLDER = sys.argv[1:]
 MODULE = "bl_ext.user_default.selfcorrect"
 
 
@@ -160,7 +160,8 @@ def main():
     found["failing"], found["settings after failing"] = attempt(), settings()
     scene.selfcorrect.denoiser = ""
     found["cancelled"] = cancelled()
-    scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
+    scene.frame_start, scene.frame_end, scene.frame_step = -1, 1, 2
+    bpy.app.binary_path = PROGRAM  # from here on as in Blender itself, which renders with another of its kind
     found["animation"], found["source"] = attempt(animation=True), image.source
     scene.render.engine = "BLENDER_WORKBENCH"
     found["engine"] = attempt()

@@ -59,14 +59,14 @@ def plan(scene: bpy.types.Scene, command: str | None, frames: range, scratch: Pa
         raise WorkError(f"{copy}: {' '.join(str(error).split())}") from None
     samples = own.samples or scene.cycles.samples
     shot = f"{frames[0]}-{frames[-1]}x{frames.step}"
-    flags = ["-o", str(folder), "--spp", str(samples + samples % 2), "--frames", shot, "--name", name]
+    flags = ["-o", str(folder), "--spp", str(samples + samples % 2), f"--frames={shot}", "--name", name]
     a, b, corrected = (str(folder / f"{name}{half}.####.exr") for half in ("_a", "_b", ""))
     outputs = [folder / f"{name}.{frame:04d}.exr" for frame in frames]
     if len(frames) == 1:
         correct = [command, "frame", *(text.replace("####", f"{frames[0]:04d}") for text in (a, b))]
         correct += ["-o", str(outputs[0])]
     else:
-        correct = [command, "sequence", a, b, "-o", corrected, "--frames", shot]
+        correct = [command, "sequence", a, b, "-o", corrected, f"--frames={shot}"]
     correct += ["--denoiser", own.denoiser] if own.denoiser else []
     correct += ["--preset", own.preset] if own.preset else []
     render = [*_blender(copy), "--scene-name", scene.name, *flags]
