@@ -160,7 +160,7 @@ def main():
     found["failing"], found["settings after failing"] = attempt(), settings()
     scene.selfcorrect.denoiser = ""
     found["cancelled"] = cancelled()
-    scene.frame_start, scene.frame_end, scene.frame_step = -1, 1, 2
+    scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
     bpy.app.binary_path = PROGRAM  # from here on as in Blender itself, which renders with another of its kind
     found["animation"], found["source"] = attempt(animation=True), image.source
     scene.render.engine = "BLENDER_WORKBENCH"

@@ -40,7 +40,7 @@ def test_blender_takes_the_zip_for_valid(archive: Path) -> None:
 
 
 def program(folder: Path) -> Path:
-    """Stands for the program `blender`, which no package registry has: the same flags, but the module bpy behind them."""
+    """Stands for the program `blender`, which no registry has: the same flags, and the module bpy behind."""
     script, path = folder / "program.py", folder / "blender"
     script.write_text(
         "import runpy, sys, bpy\n"
@@ -138,7 +138,7 @@ def test_an_animation(found: dict[str, Any]) -> None:
     assert found["animation"] == ["FINISHED"]
     assert found["source"] == "SEQUENCE"
     names = {path.name for path in (found["folder"] / "out").iterdir()}
-    assert names == {f"room{half}.{frame}.exr" for half in ("", "_a", "_b") for frame in ("-001", "0001")}
+    assert names == {f"room{half}.{frame}.exr" for half in ("", "_a", "_b") for frame in ("0001", "0003")}
 
 
 @pytest.mark.blender
