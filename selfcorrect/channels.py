@@ -128,30 +128,48 @@ LAYOUTS = (
 )
 
 
-def full_names(parts: Sequence[tuple[str, Sequence[str]]]) -> list[list[str]]:
+def full_names(parts: Sequence[tuple[str, Sequence[str]]], views: Sequence[str] = ()) -> list[list[str]]:
     """Full names of the channels: ``part.channel`` where the channel alone does not say its pass.
 
     Blender 5 names a part ``ViewLayer.Combined`` (``ViewLayer.Combined-left`` for one eye) and its channels
     ``ViewLayer.Combined.R``, which is full already; other packages name them ``R``. The name of the only part
     of a file says nothing about its channels.
 
+    Where there are several views, each is a layer around all of its own: ``left.ViewLayer.Combined.R``, for which
+    Blender 4 writes ``ViewLayer.Combined.left.R``.
+
     Args:
         parts: name and channel names of each part.
+        views: the views that the file names (its attribute ``multiView``).
 
     Returns:
         The full names in the same order, each only once in the file.
     """
+    split = [[_view(channel, part, views) for channel in channels] for part, channels in parts]
+    several = len({*views, *(view for names in split for view, _ in names if view)}) > 1
     taken: set[str] = set()
     full = []
-    for part, channels in parts:
+    for (part, channels), seen in zip(parts, split, strict=True):
         names = []
-        for channel in channels:
+        for channel, (view, plain) in zip(channels, seen, strict=True):
             complete = len(parts) == 1 or not part or _starts_with_pass(channel, part)
-            name = channel if complete and channel not in taken else f"{part}.{channel}"
+            name = f"{view}.{plain}" if several and view else plain
+            name = name if complete and name not in taken else f"{part}.{channel}"
             taken.add(name)
             names.append(name)
         full.append(names)
     return full
+
+
+def _view(channel: str, part: str, views: Sequence[str]) -> tuple[str, str]:
+    """The view of a channel, empty where none is named, and the channel's name without it."""
+    above, _, component = channel.rpartition(".")
+    if above and part.startswith(f"{above}-"):
+        return part.removeprefix(f"{above}-"), channel
+    around, _, word = above.rpartition(".")
+    if word in views:
+        return word, f"{around}.{component}" if around else component
+    return "", channel
 
 
 def _starts_with_pass(channel: str, part: str) -> bool:
@@ -184,8 +202,9 @@ def choose(
     Args:
         names: full channel names, in the order of the file (see :func:`full_names`).
         file: what messages call the file.
-        layer: the layer to take; None takes the first of :func:`layers`, or, where no known pass is found,
-            the only pass with R, G, B that plays no other role (Mitsuba's ``<image>.R``).
+        layer: the layer to take, or a view, for its first layer; None takes the first of :func:`layers`, or,
+            where no known pass is found, the only pass with R, G, B that plays no other role (Mitsuba's
+            ``<image>.R``).
         mapping: role → name of the user's own pass (``albedo`` → ``my_aov``), of one channel, or of several
             channels with commas between them.
 
@@ -308,10 +327,12 @@ def _color(names: Sequence[str], layer: str | None, file: str) -> tuple[str, ...
             f"{file}: expected a colour pass ({passes}), but got {listed(names)}; "
             "name the layer that holds the colour as FILE.exr::LAYER"
         )
-    inside = _inside(names, known[0] if layer is None else layer)
-    for entry in _entries("color"):
-        if found := _find(inside, entry):
-            return found
+    wanted = [layer, *(name for name in known if name.startswith(f"{layer}."))] if layer is not None else known
+    for name in wanted[:2]:
+        inside = _inside(names, name)
+        for entry in _entries("color"):
+            if found := _find(inside, entry):
+                return found
     there = f"the layers {listed(known)}" if any(known) else f"the channels {listed(names)}"
     raise ChannelError(f"{file}: expected a layer with a colour pass, but got '{layer}'; there are {there}")
 

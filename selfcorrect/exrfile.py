@@ -72,7 +72,8 @@ class ExrFile:
 
     @cached_property
     def _places(self) -> dict[str, tuple[int, str]]:
-        full = channels.full_names([(part.name, list(part.channels)) for part in self.parts])
+        views = self.parts[0].header.get("multiView", [])
+        full = channels.full_names([(part.name, list(part.channels)) for part in self.parts], views)
         return {
             name: (index, channel)
             for index, (part, names) in enumerate(zip(self.parts, full, strict=True))

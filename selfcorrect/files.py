@@ -71,6 +71,12 @@ def load(sources: Sources) -> Loaded:
         raise FrameError(
             f"{sources.b}: expected {width}x{height} pixels like {sources.a}, but got {other[1]}x{other[0]}"
         )
+    windows = [half.file.parts[half.file.place(half.taken["color"][0])[0]].data_window for half in (half_a, half_b)]
+    if windows[0] != windows[1]:
+        raise FrameError(
+            f"{sources.b}: expected the data window {tuple(windows[0])} of {sources.a}, but got {tuple(windows[1])}; "
+            "render both halves without cropping to what is seen"
+        )
     pairs: dict[str, Any] = {"color": (half_a.buffers["color"], half_b.buffers["color"])}
     taken = {"color": half_a.taken["color"]}
     for role in _FEATURES:

@@ -1,10 +1,18 @@
 """What every test shares: the development frames, and fresh memory that is never zero by luck."""
 
 import os
+import platform
+import sys
 from pathlib import Path
 
 import pytest
 import torch
+
+HAS_BLENDER = sys.version_info[:2] == (3, 11) and platform.machine() != "aarch64"
+"""Where the package bpy has a wheel, the tests demand it."""
+
+BLENDER = Path(__file__).resolve().parent.parent / ".venv-blender" / "bin" / "python"
+"""The Python that has it; `sh scripts/setup-blender` makes it."""
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(mode=True)
@@ -22,11 +30,10 @@ def shared() -> Path:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests that need the development frames where there are none, and nowhere else."""
-    needing = [item for item in items if item.get_closest_marker("shared")]
-    if shared_folder().is_dir():
-        if os.environ.get("SELFCORRECT_REQUIRE_SHARED") and not needing:
-            raise pytest.UsageError("expected tests that need the development frames, but got none")
-        return
-    config.hook.pytest_deselected(items=needing)
-    items[:] = [item for item in items if item not in needing]
+    """Leave out the tests of what this machine cannot have: the development frames, Blender; and no others."""
+    there = {"shared": shared_folder().is_dir(), "blender": HAS_BLENDER}
+    if os.environ.get("SELFCORRECT_REQUIRE_SHARED") and not any(item.get_closest_marker("shared") for item in items):
+        raise pytest.UsageError("expected tests that need the development frames, but got none")
+    lacking = [item for item in items if any(item.get_closest_marker(need) and not there[need] for need in there)]
+    config.hook.pytest_deselected(items=lacking)
+    items[:] = [item for item in items if item not in lacking]

@@ -308,8 +308,13 @@ def test_an_unknown_layer_is_an_error_that_lists_the_layers():
         ),
         pytest.param(
             [("L.Combined-left", ["L.Combined.R"]), ("L.Combined-right", ["L.Combined.R"])],
-            [["L.Combined.R"], ["L.Combined-right.L.Combined.R"]],
+            [["left.L.Combined.R"], ["right.L.Combined.R"]],
             id="blender 5 in stereo",
+        ),
+        pytest.param(
+            [("L.Combined-left", ["L.Combined.R"]), ("L.Depth-left", ["L.Depth.V"])],
+            [["L.Combined.R"], ["L.Depth.V"]],
+            id="blender 5, one eye",
         ),
         pytest.param(
             [("rgba", ["R", "A"]), ("albedo", ["R"]), ("N", ["N.X"]), ("", ["id"])],
@@ -320,6 +325,22 @@ def test_an_unknown_layer_is_an_error_that_lists_the_layers():
 )
 def test_full_names(parts, expected):
     assert channels.full_names(parts) == expected
+
+
+def test_views_in_one_part():
+    names = [f"L.{p}.{view}.{c}" for p in ("Combined", "Denoising Albedo") for view in ("left", "right") for c in "RGB"]
+    (full,) = channels.full_names([("", names)], ["left", "right"])
+    assert full[0] == "left.L.Combined.R"
+    assert channels.layers(full) == ["left.L", "right.L"]
+    for layer, view in ((None, "left"), ("left.L", "left"), ("right.L", "right"), ("right", "right")):
+        assert channels.choose(full, file="a.exr", layer=layer) == {
+            "color": three(f"{view}.L.Combined"),
+            "albedo": three(f"{view}.L.Denoising Albedo"),
+        }
+    (full,) = channels.full_names(
+        [("", [*"RGB", "right.R", "right.G", "right.B", "N.X", "N.right.X"])], ["left", "right"]
+    )
+    assert full == [*"RGB", "right.R", "right.G", "right.B", "N.X", "right.N.X"]
 
 
 def test_parts_named_like_passes_give_their_roles():

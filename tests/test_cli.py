@@ -181,6 +181,17 @@ class TestBadInput:
         line = refused("frame", halves[0], other, "-o", tmp_path / "out.exr", *FAST)
         assert "small.exr: expected 30x24 pixels" in line
 
+    def test_halves_of_different_windows(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
+        """What a renderer that crops to what is seen may write: as large, but elsewhere."""
+        window = (np.array([2, 1], np.int32), np.array([31, 24], np.int32))
+        source = OpenEXR.File(str(halves[1]), separate_channels=True)
+        moved = {name: channel.pixels for name, channel in source.channels().items()}
+        other = str(tmp_path / "moved.exr")
+        OpenEXR.File({"dataWindow": window, "displayWindow": window}, moved).write(other)
+        line = refused("frame", halves[0], other, "-o", tmp_path / "out.exr")
+        assert "moved.exr: expected the data window (0, 0, 29, 23)" in line
+        assert "but got (2, 1, 31, 24); render both halves without cropping" in line
+
     def test_missing_colour(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
         other = write_half(tmp_path / "no-red.exr", 3, R=None)
         assert "no-red.exr" in refused("frame", halves[0], other, "-o", tmp_path / "out.exr", *FAST)

@@ -217,6 +217,51 @@ def test_files_of_the_reference_implementation(tmp_path):
     assert np.array_equal(half.buffers["denoised"][..., 1], pixels(901, np.float32))
 
 
+@pytest.mark.parametrize(
+    ("color", "others", "taken"),
+    [
+        pytest.param(
+            "shot_RGB_IMAGEPIPELINE_0.0003.exr",
+            {
+                "shot_ALBEDO.0003.exr": "RGB",
+                "shot_AVG_SHADING_NORMAL.0003.exr": "RGB",
+                "shot_DEPTH.0003.exr": "Z",
+                "shot_ALBEDO.0004.exr": "RGB",
+            },
+            {
+                "color": [*"RGB"],
+                "albedo": [f"shot_ALBEDO.0003.exr:{c}" for c in "RGB"],
+                "normal": [f"shot_AVG_SHADING_NORMAL.0003.exr:{c}" for c in "RGB"],
+                "depth": ["shot_DEPTH.0003.exr:Z"],
+            },
+            id="luxcore",
+        ),
+        pytest.param(
+            "colorB.exr",
+            {"albedoB.exr": "RGB", "albedoA.exr": "RGB", "normal.exr": "XYZ", "depth.exr": "Y", "visibilityB.exr": "Y"},
+            {
+                "color": [*"RGB"],
+                "albedo": [f"albedoB.exr:{c}" for c in "RGB"],
+                "normal": [f"normal.exr:{c}" for c in "XYZ"],
+                "depth": ["depth.exr:Y"],
+                "visibility": ["visibilityB.exr:Y"],
+            },
+            id="tungsten",
+        ),
+    ],
+)
+def test_files_beside_each_other(tmp_path, color, others, taken):
+    files = {color: "RGB"} | others
+    for number, (name, letters) in enumerate(files.items()):
+        save(tmp_path / name, arrays(letters, start=10 * number))
+    half = exr.load_half(tmp_path / color)
+    assert {role: half.taken[role] for role in sorted(half.taken)} == {role: taken[role] for role in sorted(taken)}
+    first = half.taken["albedo"][0].partition(":")[0]
+    assert np.array_equal(half.buffers["albedo"][..., 2], pixels(10 * list(files).index(first) + 2).astype(np.float32))
+    rewrite(tmp_path / color, tmp_path / "out.exr")
+    assert_passed_through(tmp_path / color, tmp_path / "out.exr", but="RGB")
+
+
 def test_a_buffer_in_the_file_comes_before_a_file_beside_it(tmp_path):
     save(tmp_path / "albedo.exr", arrays("RGB", start=50))
     save(tmp_path / "normal.exr", arrays("XYZ", start=60))
