@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from selfcorrect import cli_sequence, exr, files, metrics
-from selfcorrect.cli_run import Runner, add_run_flags, answer, log, mapping
+from selfcorrect.cli_run import EndOnInterrupt, Runner, add_run_flags, answer, log, mapping
 from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
@@ -93,8 +93,9 @@ def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tu
     runner = Runner(options, given=sources.denoised_a is not None)
     remove_abandoned(exr.check_target(output).parent)
     loaded = files.load(sources)
-    corrected = runner.correct(loaded, began=start)
-    return runner.write(output, loaded, corrected, {}), corrected.frame
+    with EndOnInterrupt() as stop:
+        corrected = runner.correct(loaded, began=start, stop=stop)
+        return runner.write(output, loaded, corrected, {}), corrected.frame
 
 
 def _inspect(options: argparse.Namespace) -> None:

@@ -2,10 +2,12 @@
 
 import argparse
 import json
+import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -22,7 +24,9 @@ from selfcorrect.independence import doubts
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 
-__all__ = ["Corrected", "Runner", "add_run_flags", "answer", "log", "mapping"]
+__all__ = ["Corrected", "EndOnInterrupt", "Runner", "add_run_flags", "answer", "log", "mapping"]
+
+_WRITE_SECONDS = 5e-7  # a pixel
 
 
 def log(line: str) -> None:
@@ -51,12 +55,24 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("settings, by default those of the preset")
     for f in fields(Settings):
         how: dict[str, Any] = {"type": type(f.default), "metavar": "|".join(f.metadata["choices"]) or "N"}
+        if f.name == "time_budget":
+            how = {"type": _seconds, "metavar": "10s"}
         if isinstance(f.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
         presets = ", ".join(f"{name}: {getattr(s, f.name)}" for name, s in Settings.presets().items())
         group.add_argument(
             f"--{f.name.replace('_', '-')}", default=None, help=f"{f.metadata['help']} ({presets})", **how
         )
+
+
+def _seconds(text: str) -> float:
+    """Seconds from 10, 10s, 2m or 1h."""
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
+    try:
+        return float(number) * unit
+    except ValueError:
+        raise SettingsError(f"expected a time like 10s or 2m, but got {text!r}") from None
 
 
 def _settings(options: argparse.Namespace) -> Settings:
@@ -141,8 +157,9 @@ class Runner:
         meanwhile: Callable[[], None] | None = None,
         *,
         began: float | None = None,
+        stop: Callable[[], bool] | None = None,
     ) -> Corrected:
-        """Denoise and correct a frame; ``meanwhile`` is called after every step."""
+        """Denoise and correct a frame; ``meanwhile`` is called after every step, ``stop`` says when to end training."""
         start = time.perf_counter()
         began = start if began is None else began
         seconds = {"read": start - began}
@@ -157,8 +174,22 @@ class Runner:
             if any(repairs):
                 log(f"{name}: {repairs.non_finite} pixels were NaN or infinite, {repairs.negative} negative; repaired")
         with _Progress(meanwhile) as progress:
-            result = correct(frame.to(self._options.device), self.settings, warm_start=network, progress=progress)
+            result = correct(
+                frame.to(self._options.device),
+                self._left(time.perf_counter() - began, frame),
+                warm_start=network,
+                progress=progress,
+                stop=stop,
+            )
         return Corrected(frame, result, denoiser, began, seconds)
+
+    def _left(self, spent: float, frame: Frame) -> Settings:
+        """The settings with what is left of the time budget after reading and denoising, and for writing."""
+        if not self.settings.time_budget:
+            return self.settings
+        writing = _WRITE_SECONDS * frame.size[0] * frame.size[1]
+        # a budget that is spent already must not turn into none
+        return replace(self.settings, time_budget=max(self.settings.time_budget - spent - writing, 1e-9))
 
     def write(self, output: str, loaded: files.Loaded, corrected: Corrected, more: Mapping[str, Any]) -> dict[str, Any]:
         """Write a frame; returns what --json prints. ``more`` is kept in the output's attribute, too."""
@@ -237,6 +268,32 @@ def _aov_names(text: str) -> list[str]:
     if not set(names) <= {"error", "blend"}:
         raise SettingsError(f"expected --aov error, blend or both, but got {text!r}")
     return names
+
+
+class EndOnInterrupt:
+    """While it is entered, the first Ctrl-C asks training to end; the second one interrupts as usual."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._before: Any = None
+
+    def __call__(self) -> bool:
+        """Whether training is asked to end."""
+        return self._asked
+
+    def __enter__(self) -> "EndOnInterrupt":
+        self._before = signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _handle(self, *_: object) -> None:
+        if self._asked:
+            raise KeyboardInterrupt
+        self._asked = True
+        # not log(): its lock may be held by the very thread that this interrupts
+        os.write(2, b"interrupted: writing what has been learned so far; again to write nothing\n")
 
 
 class _Progress:

@@ -27,6 +27,7 @@ _PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that o
 _ERROR_TILE = 16  # pixels whose evidence may be correlated: standard errors are taken over tiles of this side
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
+_LEAST_CERTAINTY = 1.5  # standard errors of the gain: frames that gain have 4 and more, fireflies in training give 2
 _LARGEST_SCALE = 1.02  # of the whole image, to keep its light
 _DISAGREEMENT = 0.5  # (max − min) / (max + min) of the denoised halves: one of them has left a firefly
 _BIAS_SHRINKS = 0.45  # how much of the denoiser's change with the noise is taken for a change of its bias
@@ -109,7 +110,8 @@ def guard(
         gain += judged
         unweighted += judged / weight[1 - i]
     # More than chance, in the weights that decide and in those of the metric.
-    improved = float(gain.mean()) > _tile_error(gain) and float((_metric_weight(full, scale) * unweighted).mean()) > 0
+    in_metric = _metric_weight(full, scale) * unweighted
+    improved = _certainty(gain) > 1 and _certainty(in_metric) > _LEAST_CERTAINTY
 
     alpha = _pooled(n[0] + n[1], d[0] + d[1]) if improved else torch.zeros_like(gain)
     image = full + alpha[..., None] * (corrected_full.double() - full)
@@ -194,6 +196,12 @@ def _tile_error(image: Tensor) -> float:
     if len(tiles) == 1:
         return float(tiles.abs())
     return float(tiles.std()) / math.sqrt(len(tiles))
+
+
+def _certainty(image: Tensor) -> float:
+    """The mean in units of its standard error."""
+    mean, error = float(image.mean()), _tile_error(image)
+    return mean / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
 
 
 def _level(radiance: Tensor) -> Tensor:

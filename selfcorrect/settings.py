@@ -1,7 +1,7 @@
 """One settings object. The command's flags are its fields; every default names its source."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Self
 
 from selfcorrect.errors import SettingsError
@@ -57,6 +57,7 @@ class Settings:
         f"{_PAPER}, published code",
         choices=("fp32", "bf16"),
     )
+    networks: int = _setting(1, "trained from other seeds; their outputs are averaged", f"{_PAPER}, Sec. 4", least=1)
     patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1)
     stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
@@ -109,27 +110,31 @@ class Settings:
     def presets(cls) -> dict[str, Self]:
         """Every preset by its name; the first is the default.
 
-        ``paper`` is Back et al. 2022 as published. ``balanced`` is what `scripts/bench_quality.py` found on the
-        development frames: README has its table.
+        ``paper`` is Back et al. 2022 as published. The others are points of the trade of speed for accuracy that
+        `scripts/bench_tradeoff.py` measures: README has its table.
         """
+        balanced = cls(
+            patch=64,
+            batch=4,
+            steps=200,
+            warm_steps=67,
+            learning_rate=2e-3,
+            warm_learning_rate=1e-3,
+            rate_from_variance=False,
+            schedule="cosine",
+            gradient_limit=1.0,
+            input_scale=0.0,
+            log_radiance=True,
+            initialisation="residual",
+            inference="full",
+            guard=True,
+            crossed_weights=True,
+            precision="bf16",
+        )
         return {
-            "balanced": cls(
-                patch=64,
-                batch=4,
-                steps=400,
-                warm_steps=133,
-                learning_rate=1e-3,
-                warm_learning_rate=5e-4,
-                rate_from_variance=False,
-                schedule="cosine",
-                gradient_limit=1.0,
-                input_scale=0.0,
-                log_radiance=True,
-                initialisation="residual",
-                inference="full",
-                guard=True,
-                crossed_weights=True,
-            ),
+            "balanced": balanced,
+            "fast": replace(balanced, steps=60, warm_steps=30, learning_rate=4e-3, warm_learning_rate=2e-3),
+            "best": replace(balanced, networks=4),
             "paper": cls(),
         }
 
