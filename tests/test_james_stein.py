@@ -12,7 +12,7 @@ from selfcorrect import Frame, exr, metrics
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.frame import mean
 from selfcorrect.stages.james_stein import SIGMA, WINDOW, james_stein, relative_weight, variance_of_mean
-from selfcorrect.stages.windows import box_mean, gaussian_mean, reflect, reflected
+from selfcorrect.windows import box_mean, gaussian_mean, reflect, reflected
 
 FRAMES = ("bathroom", "classroom", "dining-room", "living-room-2", "staircase")
 

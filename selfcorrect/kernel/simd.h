@@ -14,6 +14,11 @@
 #define SELFCORRECT_LANES 4
 #endif
 
+// name -> name_avx512, ...: an entry of the variant that is being compiled.
+#define SELFCORRECT_JOIN(name, suffix) name##suffix
+#define SELFCORRECT_JOIN_EXPANDED(name, suffix) SELFCORRECT_JOIN(name, suffix)
+#define SELFCORRECT_VARIANT(name) SELFCORRECT_JOIN_EXPANDED(name, SELFCORRECT_SUFFIX)
+
 namespace {
 
 constexpr int lanes = SELFCORRECT_LANES;

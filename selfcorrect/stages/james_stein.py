@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
-from selfcorrect.stages.windows import box_mean, gaussian_mean
+from selfcorrect.windows import box_mean, gaussian_mean
 
 __all__ = ["WINDOW", "james_stein", "relative_weight", "variance_of_mean"]
 
