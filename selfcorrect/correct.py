@@ -1,4 +1,4 @@
-"""Optimise on one frame, infer, guard. No files, no printing, no reference image."""
+"""The stages on one frame: optimise, infer, what stands around that, guard. No files, no printing, no reference."""
 
 import time
 from dataclasses import dataclass
@@ -14,6 +14,8 @@ from selfcorrect.kernel import LARGEST, Guides, cross_bilateral
 from selfcorrect.network import Network
 from selfcorrect.patches import overhang
 from selfcorrect.settings import Settings
+from selfcorrect.stages import steps
+from selfcorrect.stages.steps import State
 from selfcorrect.train import Progress, train
 
 __all__ = ["Result", "correct"]
@@ -25,7 +27,7 @@ class Result:
 
     Attributes:
         image: corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as the frame's colour was.
-        network: the trained network, for the next call's ``warm_start``.
+        network: the trained network, for the next call's ``warm_start``; None where the core did not run.
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
@@ -35,7 +37,7 @@ class Result:
     """
 
     image: Any
-    network: Network
+    network: Network | None
     losses: list[float]
     seconds: dict[str, float]
     estimate: Estimate | None
@@ -68,11 +70,41 @@ def correct(
     settings = settings or Settings.preset(Settings.default())
     if frame.denoised is None:
         raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
-    start = time.perf_counter()
+    if warm_start is not None and "core" not in settings.stage_names:
+        raise FrameError(f"expected the stage core with a warm start, but got the stages {settings.stages}")
     scale = settings.input_scale or _automatic_scale(frame)
     halves = _scaled(frame, scale)
-    margin = overhang(frame.size, settings) + settings.window // 2
-    guides = (_guides(halves[0], margin), _guides(halves[1], margin))
+    start = State(halves, _full(frame, halves, scale))
+    state, network, losses, seconds = start, None, list[float](), dict[str, float]()
+    for name in settings.stage_names:
+        begun = time.perf_counter()
+        if name == "core":
+            network, losses = _trained(state, settings, warm_start, progress)
+            seconds["train"] = time.perf_counter() - begun
+            trained = time.perf_counter()
+            state = _inferred(state, network, settings)
+            seconds["infer"] = time.perf_counter() - trained
+        else:
+            state = _STEPS[name](state, settings)
+            seconds[name] = time.perf_counter() - begun
+    begun = time.perf_counter()
+    image, guarded = _finish(frame, start, state, settings, scale)
+    if guarded:
+        seconds["guard"] = time.perf_counter() - begun
+    estimate, aovs = (guarded.estimate, _aovs(guarded)) if guarded else (None, {})
+    return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale)
+
+
+_STEPS = {"regression": steps.regress, "james-stein": steps.james_stein}
+
+
+def _trained(
+    state: State, settings: Settings, warm_start: Network | None, progress: Progress | None
+) -> tuple[Network, list[float]]:
+    """The network optimised on this frame, and its losses."""
+    height, width, _ = state.full.shape
+    margin = overhang((height, width), settings) + settings.window // 2
+    guides = (_guides(state.halves[0], margin), _guides(state.halves[1], margin))
     generator = torch.Generator().manual_seed(settings.seed)
     network = Network.for_guides(guides[0], settings, generator)
     if warm_start is not None:
@@ -82,12 +114,7 @@ def correct(
                 f"but got {warm_start.shape[0]} … {warm_start.shape[-2]}: other buffers or settings"
             )
         network.load_state_dict(warm_start.state_dict())
-    losses = train(network, guides, settings, generator, progress)
-    trained = time.perf_counter()
-    image, guarded = _finish(frame, halves, network, settings, scale)
-    estimate, aovs = (guarded.estimate, _aovs(guarded)) if guarded else (None, {})
-    seconds = {"train": trained - start, "infer": time.perf_counter() - trained}
-    return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale)
+    return network, train(network, guides, settings, generator, progress)
 
 
 def _automatic_scale(frame: Frame) -> float:
@@ -105,6 +132,16 @@ def _scaled(frame: Frame, scale: float) -> tuple[Half, Half]:
         return half._replace(color=_bounded(half.color, scale), denoised=_bounded(half.denoised, scale))
 
     return one(frame.halves[0]), one(frame.halves[1])
+
+
+def _full(frame: Frame, halves: tuple[Half, Half], scale: float) -> Tensor:
+    """The denoised mean of the halves where there is one, else the mean of the denoised halves."""
+    if frame.denoised_full is not None:
+        return _bounded(frame.denoised_full, scale)
+    a, b = halves[0].denoised, halves[1].denoised
+    assert a is not None
+    assert b is not None
+    return mean((a, b))
 
 
 def _bounded(radiance: Tensor, scale: float) -> Tensor:
@@ -129,32 +166,30 @@ def _aovs(guarded: Guarded) -> dict[str, Tensor]:
     return {"blend": guarded.alpha, "error.before": guarded.errors[0], "error.after": guarded.errors[1]}
 
 
-def _finish(
-    frame: Frame, halves: tuple[Half, Half], network: Network, settings: Settings, scale: float
-) -> tuple[Tensor, Guarded | None]:
-    """The result from the trained network, in the frame's own units."""
-    assert frame.denoised is not None
-    assert halves[0].denoised is not None
-    assert halves[1].denoised is not None
-    denoised = (halves[0].denoised, halves[1].denoised)
-    given = frame.denoised_full
-    full = mean(denoised) if given is None else _bounded(given, scale)
+def _inferred(state: State, network: Network, settings: Settings) -> State:
+    """What the trained network makes of each half with its own image, and of both with the full one or their own."""
 
     def infer(shown: Tensor | None) -> tuple[Tensor, Tensor]:
-        return _infer(network, halves[0], shown, settings), _infer(network, halves[1], shown, settings)
+        return _infer(network, state.halves[0], shown, settings), _infer(network, state.halves[1], shown, settings)
 
-    with_halves = infer(None) if settings.guard or settings.inference == "halves" else None
-    with_full = infer(full) if settings.inference == "full" else with_halves
+    later = settings.guard or settings.stage_names[-1] != "core"
+    with_halves = infer(None) if later or settings.inference == "halves" else None
+    with_full = infer(state.full) if settings.inference == "full" else with_halves
     assert with_full is not None
-    image = mean(with_full).clamp(min=0)
+    return state.then(with_halves or with_full, mean(with_full).clamp(min=0))
+
+
+def _finish(
+    frame: Frame, start: State, state: State, settings: Settings, scale: float
+) -> tuple[Tensor, Guarded | None]:
+    """What the stages made of the frame, guarded against what the denoiser had, in the frame's own units."""
     if not settings.guard:
-        return _unscaled(image, scale), None
-    assert with_halves is not None
-    color = (halves[0].color, halves[1].color)
-    guarded = guard(color, denoised, with_halves, full, image, scale=scale)
+        return _unscaled(state.full, scale), None
+    guarded = guard(start.color, start.images, state.images, start.full, state.full, scale=scale)
     if not guarded.estimate.improved:
-        return (mean(frame.denoised) if given is None else given), guarded
-    return _unscaled(keep_light(guarded.image, full, color), scale), guarded
+        assert frame.denoised is not None
+        return (mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full), guarded
+    return _unscaled(keep_light(guarded.image, start.full, start.color), scale), guarded
 
 
 def _unscaled(image: Tensor, scale: float) -> Tensor:

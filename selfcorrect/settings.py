@@ -10,6 +10,7 @@ __all__ = ["Settings"]
 
 _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench_quality.py measures it"
+_STAGES = "not in the paper; scripts/bench_stages.py measures it"
 
 
 def _setting(default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0) -> Any:
@@ -29,10 +30,20 @@ def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) ->
     expected, types = _KINDS[kind]
     if not isinstance(value, types) or (isinstance(value, bool) and kind is not bool):
         raise SettingsError(f"expected {expected} for the setting {name}, but got {value!r}")
-    if kind is str and value not in metadata["choices"]:
+    if kind is str and metadata["choices"] and value not in metadata["choices"]:
         raise SettingsError(f"expected {name} out of {', '.join(metadata['choices'])}, but got {value!r}")
     if isinstance(value, (int, float)) and not metadata["least"] <= value < float("inf"):
         raise SettingsError(f"expected {name} of at least {metadata['least']}, but got {value!r}")
+
+
+STAGES = ("regression", "core", "james-stein")
+
+
+def _check_stages(stages: str) -> None:
+    names = stages.split(",")
+    unknown = [name for name in names if name not in STAGES]
+    if unknown or len(set(names)) < len(names):
+        raise SettingsError(f"expected stages out of {','.join(STAGES)}, each at most once, but got {stages!r}")
 
 
 @dataclass(frozen=True)
@@ -43,6 +54,10 @@ class Settings:
         SettingsError: a value is out of range.
     """
 
+    stages: str = _setting("core", f"what runs, in this order, before the guard: out of {','.join(STAGES)}", _STAGES)
+    regression_stride: int = _setting(
+        2, "the stage regression solves a model at every so many-th pixel of as many rows", _STAGES, least=1
+    )
     combination: str = _setting(
         "eq10", "what the window's pixels are combined to", f"{_PAPER}, Table 1", choices=("eq10", "eq3")
     )
@@ -84,10 +99,18 @@ class Settings:
     def __post_init__(self) -> None:
         for f in fields(self):
             _check(f.name, getattr(self, f.name), type(f.default), f.metadata)
+        _check_stages(self.stages)
+        if self.regression_stride > 16:
+            raise SettingsError(f"expected a regression_stride of at most 16, but got {self.regression_stride}")
         if self.window % 2 == 0 or self.window > 31:
             raise SettingsError(f"expected an odd window of at most 31, but got {self.window}")
         if not self.steps and self.stride > self.patch:
             raise SettingsError(f"expected a stride of at most the patch ({self.patch}), but got {self.stride}")
+
+    @property
+    def stage_names(self) -> tuple[str, ...]:
+        """What runs, in order."""
+        return tuple(self.stages.split(","))
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
