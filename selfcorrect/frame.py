@@ -120,9 +120,14 @@ class Frame:
         """This frame with each half denoised on its own, with its own G-buffers.
 
         Args:
-            denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors.
-            full: also denoise the mean of the halves.
+            denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors; if its ``dual`` is True,
+                once as ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs of them.
+            full: also denoise the mean of the halves; with a dual denoiser it is the mean of the denoised halves.
         """
+        if getattr(denoiser, "dual", False):
+            features = {name: getattr(self, name) for name in ("albedo", "normal", "depth", "visibility")}
+            pair = denoiser.pair(self.color, **features)  # type: ignore[attr-defined]  # only a dual one has it
+            return self.with_denoised(pair, mean(pair) if full else None)
         inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
         pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
         if not full:

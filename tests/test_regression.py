@@ -86,7 +86,7 @@ def test_what_a_fit_knows_of_each_half(denoiser: str, of_target: float, of_featu
         ):
             for fit, target, other in zip(fits, errors, errors[::-1], strict=True):
                 shares = [float(((fit - truth) * error).mean() / error.var()) for error in (target, other)]
-                sums += torch.tensor(shares) / (2 * rounds)
+                sums.add_(torch.tensor(shares) / (2 * rounds))
     assert float(crossed[0]) == pytest.approx(of_target, abs=0.006)
     assert float(crossed[1]) == pytest.approx(of_features, abs=0.01)
     assert abs(float(own[1])) < 0.0015  # of chance: 12 numbers are fitted to thousands

@@ -3,4 +3,5 @@
 
 #include <nanobind/nanobind.h>
 
+void bind_nlm(nanobind::module_& m);
 void bind_regression(nanobind::module_& m);

@@ -88,5 +88,6 @@ NB_MODULE(_cpu, m) {
               run(job, Mode::loss, instruction_set, threads);
           });
 
+    bind_nlm(m);
     bind_regression(m);
 }

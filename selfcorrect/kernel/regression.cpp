@@ -19,8 +19,6 @@ inline int ceil_div(int a, int b) { return a >= 0 ? (a + b - 1) / b : -(-a / b);
 inline int floor_div(int a, int b) { return -ceil_div(-a, b); }
 constexpr int smaller(int a, int b) { return a < b ? a : b; }
 
-inline Float minimum(Float a, Float b) { return -maximum(-a, -b); }
-
 inline Float square_root(Float x) {
     float lane[lanes];
     store(lane, x);

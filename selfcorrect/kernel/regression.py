@@ -6,18 +6,19 @@ second or fourth row (``stride``) say nearly the same for a fourth or a sixteent
 """
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
-from selfcorrect.kernel import _cpu
+from selfcorrect.kernel import _cpu, nlm
 from selfcorrect.kernel.cpu import instruction_sets
 from selfcorrect.kernel.guides import LARGEST
 from selfcorrect.windows import reflect
 
-__all__ = ["regress"]
+__all__ = ["regress", "regress_non_local"]
 
 LARGEST_WINDOW = 63
 _LANES = 16  # the widest vector reads up to this many cells beyond the last one
@@ -71,6 +72,39 @@ def regress(
     _cpu.solve(*layout.arguments, *options, models)
     output = torch.empty(stride * stride, 3, layout.height, layout.width)
     _cpu.reconstruct(*layout.arguments, *options, layout.centres(models), output)
+    return layout.image(output)
+
+
+def regress_non_local(
+    features: list[Tensor],
+    targets: Tensor,
+    weights: Callable[[], Iterable[nlm.Strip]],
+    *,
+    radius: int,
+    ridge: float,
+    threads: int = 1,
+    isa: str = "",
+) -> Tensor:
+    """As :func:`regress` with a model at every pixel, but with given weights, those of non-local means.
+
+    Args:
+        features: as for :func:`regress`.
+        targets: (H, W, 3).
+        weights: gives :func:`selfcorrect.kernel.nlm.strips` of this radius; called twice.
+        radius: of the window.
+        ridge, threads, isa: as for :func:`regress`.
+    """
+    layout = Layout.of(features, targets, radius, 1)
+    models = torch.empty(3 * (layout.features + 1), layout.height, layout.width)
+    output = torch.empty(1, 3, layout.height, layout.width)
+
+    def each(function: Callable[..., None], *arrays: Tensor) -> None:
+        for strip in weights():
+            options = (ridge, 0.0, strip.weights, strip.first_row, strip.weights.shape[1])
+            function(*layout.arguments, *options, isa or instruction_sets()[-1], threads, *arrays)
+
+    each(_cpu.solve, models)
+    each(_cpu.reconstruct, layout.centres(models), output)
     return layout.image(output)
 
 

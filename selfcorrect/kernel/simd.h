@@ -43,6 +43,8 @@ inline Float maximum(Float a, Float b) {
 #endif
 }
 
+inline Float minimum(Float a, Float b) { return -maximum(-a, -b); }
+
 // 2^x for x <= 0; below 2^-126 the result is 0. Relative error 8e-8 (degree-5 minimax on [0, 1]).
 inline Float exp2_nonpositive(Float x) {
 #if defined(__AVX512F__)
