@@ -118,21 +118,21 @@ class Denoise:
         """
         if not self.dual:
             raise DenoiserError(f"denoiser {self.name}: expected a single image, but got both halves of a frame")
-        size = _checked_size("color", color[0], None)
-        _checked_size("color", color[1], size)
+        height, width = _checked_size("color", color[0], None)
+        _checked_size("color", color[1], (height, width))
         given: dict[str, Pair] = {}
         for name, pair in features.items():
             if pair is None or name not in self.features:
                 continue
             for feature in pair:
-                _checked_size(name, feature, size, channels=1 if name in ("depth", "visibility") else 3)
+                _checked_size(name, feature, (height, width), channels=1 if name in ("depth", "visibility") else 3)
             given[name] = (_float32(name, pair[0]), _float32(name, pair[1]))
         with torch.no_grad():
             results = cast(DualPlugin, self.plugin).denoise_pair(
                 (_float32("color", color[0]), _float32("color", color[1])), given
             )
         for result in results:
-            self._check_result(result, (*size, 3))
+            self._check_result(result, (height, width, 3))
         return _like(color[0], results[0]), _like(color[1], results[1])
 
     def __repr__(self) -> str:

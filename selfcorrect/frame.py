@@ -11,7 +11,7 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError
 
-__all__ = ["Frame", "Half", "Repairs", "mean"]
+__all__ = ["Frame", "Half", "Repairs", "mean", "repaired"]
 
 Pair = tuple[Any, Any]
 _CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 1, "depth": 1}
@@ -171,6 +171,15 @@ def mean(pair: Pair) -> Tensor:
     """Mean of both halves; in float64, as the sum of two large values may exceed float32."""
     average: Tensor = ((pair[0].double() + pair[1].double()) / 2).to(pair[0].dtype)
     return average
+
+
+def repaired(image: Any, what: str) -> Tensor:
+    """An (H, W, 3) array as float32, filled where it is not finite; negative values stay.
+
+    Raises:
+        FrameError: it has another shape or no floating-point numbers; ``what`` names it.
+    """
+    return _repair(_as_tensor(image, what, 3), radiance=False)[0]
 
 
 def _as_tensor(array: Any, what: str, channels: int) -> Tensor:
