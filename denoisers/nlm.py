@@ -2,8 +2,8 @@
 
 The noise is known from the two halves. Each half is filtered with weights of its own. Rousselle et al. take them from
 the other half, which keeps noise from choosing its own weights, but then each half knows the other through its weights,
-and could no longer be judged by it. So the weights are the half's own, and what keeps noise from choosing them is that its
-variance is smoothed over some pixels.
+and could no longer be judged by it. So the weights are the half's own; what keeps noise from choosing
+them is that its variance is smoothed over some pixels.
 """
 
 import torch
