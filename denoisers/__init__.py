@@ -12,15 +12,24 @@ import importlib
 import importlib.util
 from types import ModuleType
 
-from denoisers.host import Denoise, Plugin
+from denoisers.host import Denoise, DualPlugin, Plugin
 from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
-__all__ = ["Denoise", "Plugin", "create", "default", "names"]
+__all__ = ["Denoise", "DualPlugin", "Plugin", "create", "default", "names"]
 
 
 def names() -> tuple[str, ...]:
     """Return every form of a denoiser's specification that :func:`create` takes."""
-    return ("oidn", "joint-bilateral", "box", "onnx:MODEL.onnx", "command:PROGRAM AND ARGS", "file.py:Class")
+    return (
+        "oidn",
+        "joint-bilateral",
+        "box",
+        "nlm",
+        "nfor",
+        "onnx:MODEL.onnx",
+        "command:PROGRAM AND ARGS",
+        "file.py:Class",
+    )
 
 
 def default() -> str:
@@ -33,8 +42,8 @@ def create(spec: str, *, threads: int | None = None) -> Denoise:
 
     Args:
         spec: one of the forms that :func:`names` returns.
-        threads: CPU threads of ``oidn``, ``onnx`` and ``joint-bilateral``, at least 1; None leaves the
-            number to them. A command and a user's class see to their own threads.
+        threads: CPU threads of ``oidn``, ``onnx``, ``joint-bilateral``, ``nlm`` and ``nfor``, at least 1; None
+            leaves the number to them. A command and a user's class see to their own threads.
 
     Raises:
         DenoiserError: the specification is unknown, or the model, the command or the class does not fit.
@@ -47,8 +56,8 @@ def create(spec: str, *, threads: int | None = None) -> Denoise:
     return Denoise(_plugin(spec, threads))
 
 
-def _plugin(spec: str, threads: int | None) -> Plugin:
-    plugin: Plugin
+def _plugin(spec: str, threads: int | None) -> Plugin | DualPlugin:
+    plugin: Plugin | DualPlugin
     match spec.split(":", maxsplit=1):
         case ["oidn"]:
             plugin = _adapter("oidn", extra="oidn").Oidn(threads)
@@ -56,6 +65,10 @@ def _plugin(spec: str, threads: int | None) -> Plugin:
             plugin = _adapter("joint_bilateral").JointBilateral(threads)
         case ["box"]:
             plugin = _adapter("box").Box()
+        case ["nlm"]:
+            plugin = _adapter("nlm").NonLocalMeans(threads)
+        case ["nfor"]:
+            plugin = _adapter("nfor").Nfor(threads)
         case ["onnx", path] if path:
             plugin = _adapter("onnx", extra="onnx").Onnx(path, threads)
         case ["command", line] if line:

@@ -1,6 +1,6 @@
 """The host of a plug-in: it converts, checks, pads and crops, so that no plug-in has to."""
 
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 import torch
@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from denoisers.mirror import mirrored
 from selfcorrect.errors import DenoiserError, FrameError
 
-__all__ = ["Denoise", "Plugin"]
+__all__ = ["Denoise", "DualPlugin", "Plugin"]
 
 FEATURES = frozenset({"albedo", "normal"})
 
 Array = NDArray[Any] | torch.Tensor
+Pair = tuple[torch.Tensor, torch.Tensor]
 Image = TypeVar("Image", NDArray[Any], torch.Tensor)
 
 
@@ -40,14 +41,39 @@ class Plugin(Protocol):
         ...
 
 
-class Denoise:
-    """A denoiser to call: ``denoise(color, albedo=None, normal=None)``."""
+class DualPlugin(Protocol):
+    """A denoiser that needs both halves of a frame at once, to know their noise.
 
-    def __init__(self, plugin: Plugin):
+    Attributes:
+        name, multiple: as for :class:`Plugin`.
+        features: those of ``"albedo"``, ``"normal"``, ``"depth"`` and ``"visibility"`` that it uses.
+        dual: True.
+    """
+
+    name: str
+    multiple: int = 1
+    features: frozenset[str]
+    dual: bool
+
+    def denoise_pair(self, color: Pair, features: dict[str, Pair]) -> Pair:
+        """Return the denoised halves, linear and unclamped.
+
+        The arrays are as :meth:`Plugin.denoise` gets them; depth and visibility are (H, W, 1). The first result must be
+        made from the first half but for what is pooled over both (variance, a choice of bandwidth): the second is the
+        witness that the correction is learned from and judged by.
+        """
+        ...
+
+
+class Denoise:
+    """A denoiser to call: ``denoise(color, albedo=None, normal=None)``; where ``dual``, ``denoise.pair(…)``."""
+
+    def __init__(self, plugin: Plugin | DualPlugin):
         self.plugin = plugin
         self.name = plugin.name
         self.multiple = getattr(plugin, "multiple", 1)
         self.features = plugin.features
+        self.dual: bool = getattr(plugin, "dual", False)
 
     def __call__(self, color: Image, albedo: Array | None = None, normal: Array | None = None) -> Image:
         """Denoise one image.
@@ -65,6 +91,8 @@ class Denoise:
             FrameError: an array is no (H, W, 3) float array, of another size than ``color``, or not finite.
             DenoiserError: the denoiser failed, or returned another shape or values that are not finite.
         """
+        if self.dual:
+            raise DenoiserError(f"denoiser {self.name}: expected both halves of a frame, but got a single image")
         size = _checked_size("color", color, None)
         for name, feature in (("albedo", albedo), ("normal", normal)):
             if feature is not None:
@@ -72,11 +100,40 @@ class Denoise:
         pad = {"bottom": -size[0] % self.multiple, "right": -size[1] % self.multiple}
         padded: torch.Tensor = mirrored(_float32("color", color), **pad)
         with torch.no_grad():
-            result = self.plugin.denoise(
+            result = cast(Plugin, self.plugin).denoise(
                 padded, self._feature("albedo", albedo, pad), self._feature("normal", normal, pad)
             )
         self._check_result(result, tuple(padded.shape))
         return _like(color, result[: size[0], : size[1]])
+
+    def pair(self, color: tuple[Image, Image], **features: tuple[Array, Array] | None) -> tuple[Image, Image]:
+        """Denoise both halves of a frame with a plug-in that is ``dual``.
+
+        Args:
+            color: two (H, W, 3) arrays as for a single image.
+            features: albedo, normal (H, W, 3), depth, visibility (H, W, 1), each a pair or None.
+
+        Raises:
+            FrameError, DenoiserError: as for a single image.
+        """
+        if not self.dual:
+            raise DenoiserError(f"denoiser {self.name}: expected a single image, but got both halves of a frame")
+        height, width = _checked_size("color", color[0], None)
+        _checked_size("color", color[1], (height, width))
+        given: dict[str, Pair] = {}
+        for name, pair in features.items():
+            if pair is None or name not in self.features:
+                continue
+            for feature in pair:
+                _checked_size(name, feature, (height, width), channels=1 if name in ("depth", "visibility") else 3)
+            given[name] = (_float32(name, pair[0]), _float32(name, pair[1]))
+        with torch.no_grad():
+            results = cast(DualPlugin, self.plugin).denoise_pair(
+                (_float32("color", color[0]), _float32("color", color[1])), given
+            )
+        for result in results:
+            self._check_result(result, (height, width, 3))
+        return _like(color[0], results[0]), _like(color[1], results[1])
 
     def __repr__(self) -> str:
         return f"<denoiser {self.name}>"
@@ -99,10 +156,10 @@ class Denoise:
             raise DenoiserError(f"{expected} {bad} of {result.numel()} values that are NaN or infinite")
 
 
-def _checked_size(name: str, value: object, expected: tuple[int, int] | None) -> tuple[int, int]:
-    """Return (H, W) of an image that is a float array of three channels and of the expected size."""
+def _checked_size(name: str, value: object, expected: tuple[int, int] | None, channels: int = 3) -> tuple[int, int]:
+    """Return (H, W) of an image that is a float array of so many channels and of the expected size."""
     size = "H, W" if expected is None else f"{expected[0]}, {expected[1]}"
-    wanted = f"{name}: expected a NumPy or torch float array of shape ({size}, 3), but got"
+    wanted = f"{name}: expected a NumPy or torch float array of shape ({size}, {channels}), but got"
     if isinstance(value, torch.Tensor):
         floating = value.is_floating_point()
     elif isinstance(value, np.ndarray):
@@ -112,7 +169,7 @@ def _checked_size(name: str, value: object, expected: tuple[int, int] | None) ->
     if not floating:
         raise FrameError(f"{wanted} {value.dtype}")
     shape = tuple(value.shape)
-    if len(shape) != 3 or shape[2] != 3 or 0 in shape or (expected and shape[:2] != expected):
+    if len(shape) != 3 or shape[2] != channels or 0 in shape or (expected and shape[:2] != expected):
         raise FrameError(f"{wanted} {shape}")
     return shape[0], shape[1]
 

@@ -15,6 +15,7 @@ from selfcorrect.cli_run import EndOnInterrupt, Runner, add_run_flags, answer, l
 from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
+from selfcorrect.stages import uncorrelated
 
 __all__ = ["main"]
 
@@ -71,6 +72,18 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--json", action="store_true", help="one JSON object on stdout")
     compare.set_defaults(run=_compare)
 
+    combine = commands.add_parser("combine", help="combine independent with correlated renders of one frame")
+    combine.add_argument("independent", nargs=4, metavar="Y.exr", help="four renders with independent samples")
+    combine.add_argument(
+        "--correlated", nargs=4, required=True, metavar="Z.exr", help="four with common random numbers"
+    )
+    combine.add_argument("-o", "--output", required=True, metavar="OUT.exr")
+    combine.add_argument("--samples", type=int, required=True, metavar="N", help="per pixel, of each render")
+    combine.add_argument("--crossed", action="store_true", help="for a Z that was made from the Y of its number")
+    combine.add_argument("--kernel", default=uncorrelated.KERNELS[0], choices=uncorrelated.KERNELS)
+    combine.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    combine.set_defaults(run=_combine)
+
     demo = commands.add_parser("demo", help="correct the packaged frame and show what was gained")
     demo.add_argument("-o", "--output", metavar="DIR", help="keep the images here")
     add_run_flags(demo)
@@ -124,6 +137,26 @@ def _compare(options: argparse.Namespace) -> None:
     print(f"SSIM (tone-mapped)   {result.ssim:.4f}")
     print(f"FLIP                 {result.flip:.4f}")
     print(f"mean radiance ratio  {result.mean_radiance_ratio:.4f}")
+
+
+def _combine(options: argparse.Namespace) -> None:
+    start = time.perf_counter()
+    exr.check_target(options.output)
+    four = files.load_images([*options.independent, *options.correlated])
+    image, gamma = uncorrelated.combine(
+        four.images[:4],
+        four.images[4:],
+        samples=options.samples,
+        crossed=options.crossed,
+        kernel=options.kernel,
+    )
+    report = {"kernel": options.kernel, "gamma": gamma, "samples": options.samples, "crossed": options.crossed}
+    clipped = files.save_combined(options.output, four, image, details=report)
+    log(f"{options.output}: written after {time.perf_counter() - start:.1f} s (gamma {gamma:g})")
+    if clipped:
+        log(f"{options.output}: {clipped} values beyond the range of half floats were clipped")
+    if options.json:
+        answer({"output": options.output, **report})
 
 
 def _demo(options: argparse.Namespace) -> None:

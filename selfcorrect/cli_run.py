@@ -230,7 +230,7 @@ def _facts(frame: Frame, result: Result) -> dict[str, Any]:
         "repairs": {name: repairs._asdict() for name, repairs in frame.repairs.items()},
         "input_scale": result.input_scale,
         "steps": len(result.losses),
-        "parameters": sum(p.numel() for p in result.network.parameters()),
+        "parameters": 0 if result.network is None else sum(p.numel() for p in result.network.parameters()),
         "threads": torch.get_num_threads(),
     }
 

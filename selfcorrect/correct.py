@@ -1,44 +1,26 @@
-"""Optimise on one frame, infer, guard. No files, no printing, no reference image."""
+"""The stages on one frame, in order, and the guard. No files, no printing, no reference."""
 
-import copy
-import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from selfcorrect.core import Start, inferred, trained
 from selfcorrect.errors import FrameError
-from selfcorrect.frame import Frame, Half, mean
-from selfcorrect.guard import Estimate, Guarded, guard, keep_light, trust_in_full
-from selfcorrect.infer import infer, infer_tile
-from selfcorrect.kernel import LARGEST, Guides
+from selfcorrect.frame import Frame, mean
+from selfcorrect.guard import Estimate, Guarded, guard, keep_light
 from selfcorrect.network import Network
-from selfcorrect.patches import crops, overhang
 from selfcorrect.settings import Settings
-from selfcorrect.train import Limits, Progress, starting_losses, train
+from selfcorrect.stages import steps
+from selfcorrect.stages.steps import State
+from selfcorrect.train import Progress
 
 __all__ = ["Result", "Start", "correct"]
 
-_TRIAL = 256  # side of the tile whose time is taken for the time budget
-_GUARD_SECONDS = 2e-6  # a pixel, with some to spare
-
-
-class Start(NamedTuple):
-    """What training began from.
-
-    Attributes:
-        warm: from the network that was given, not from a new one.
-        cold_loss: Eq. 8 of a new network on a sample of the frame; None where no network was given.
-        warm_loss: the same of the network that was given.
-    """
-
-    warm: bool
-    cold_loss: float | None = None
-    warm_loss: float | None = None
+_STEPS = {"regression": steps.regress, "james-stein": steps.james_stein}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +29,7 @@ class Result:
 
     Attributes:
         image: corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as the frame's colour was.
-        network: the trained network, for the next call's ``warm_start``.
+        network: the trained network, for the next call's ``warm_start``; None without the core.
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
@@ -58,7 +40,7 @@ class Result:
     """
 
     image: Any
-    network: Network
+    network: Network | None
     losses: list[float]
     seconds: dict[str, float]
     estimate: Estimate | None
@@ -95,90 +77,45 @@ def correct(
     settings = settings or Settings.preset(Settings.default())
     if frame.denoised is None:
         raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
-    began = time.perf_counter()
-    scale = settings.input_scale or _automatic_scale(frame)
-    generator = torch.Generator().manual_seed(settings.seed)
-    guides = _training_guides(frame, settings, scale, generator)
-    network = Network.for_guides(guides[0], settings, generator)
-    start = Start(warm=False)
-    if warm_start is not None:
-        network.traits.check(warm_start.traits)
-        start = _start(network, warm_start, guides, settings)
-    if start.warm and warm_start is not None:
-        network.load_state_dict(warm_start.state_dict())
-    limits = Limits(stop=stop or Limits.stop)
-    if settings.time_budget:
-        reserved = _seconds_after_training(network, frame, settings, scale)
-        limits = replace(limits, seconds=settings.time_budget - reserved - (time.perf_counter() - began))
-    losses = train(network, guides, _warm(settings) if start.warm else settings, generator, progress, limits)
-    del guides
-    trained = time.perf_counter()
-    image, guarded = _finish(frame, network, settings, scale)
-    estimate, aovs = (guarded.estimate, _aovs(guarded)) if guarded else (None, {})
-    seconds = {"train": trained - began, "infer": time.perf_counter() - trained}
-    return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale, start)
+    if warm_start is not None and "core" not in settings.stage_names:
+        raise FrameError(f"expected the stage core with a warm start, but got the stages {settings.stages}")
+    given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
+    first = State(frame.halves, given, settings.input_scale or _automatic_scale(frame))
+    state, core, seconds = first, None, dict[str, float]()
 
+    def timed(name: str, begun: float) -> None:
+        seconds[name] = time.perf_counter() - begun
 
-def _training_guides(
-    frame: Frame, settings: Settings, scale: float, generator: torch.Generator
-) -> tuple[Guides, Guides]:
-    """What the network is trained on: both halves whole, or crops of them at the same places."""
-    margin = settings.window // 2
-    regions = crops(frame.size, settings, generator)
-    if not regions:
-        margin += max(overhang(frame.size, s) for s in (settings, _warm(settings)))
-
-    def one(half: Half) -> Guides:
-        assert half.denoised is not None  # correct() has checked; tells the type checker
-        cut = partial(
-            Guides.of_half,
-            half.color,
-            half.denoised,
-            margin=margin,
-            albedo=half.albedo,
-            normal=half.normal,
-            visibility=half.visibility,
-            scale=scale,
-        )
-        return Guides.stack([cut(region=region) for region in regions]) if regions else cut()
-
-    return one(frame.halves[0]), one(frame.halves[1])
-
-
-def _seconds_after_training(network: Network, frame: Frame, settings: Settings, scale: float) -> float:
-    """How long inference and guard will take, by the time of a small tile."""
-    half, pixels = frame.halves[0], frame.size[0] * frame.size[1]
-    region = (0, 0, min(frame.size[0], _TRIAL), min(frame.size[1], _TRIAL))
-    infer_tile(network, half, settings, region, scale=scale)  # the first call is slower
-    start = time.perf_counter()
-    infer_tile(network, half, settings, region, scale=scale)
-    inference = (time.perf_counter() - start) / (region[2] * region[3])
-    passes = 4 if settings.inference == "full" else 2
-    return pixels * (inference * passes + (_GUARD_SECONDS if settings.guard else 0.0))
-
-
-def _warm(settings: Settings) -> Settings:
-    """The settings of a frame that starts warm: never more steps than one that starts cold."""
-    steps = settings.warm_steps or settings.steps
-    return replace(
-        settings,
-        steps=min(steps, settings.steps or steps),
-        learning_rate=settings.warm_learning_rate or settings.learning_rate,
+    for name in settings.stage_names:
+        begun = time.perf_counter()
+        if name == "core":
+            core = trained(state, settings, warm_start=warm_start, progress=progress, stop=stop)
+            timed("train", begun)
+            begun = time.perf_counter()
+            state = inferred(state, core.network, settings)
+            timed("infer", begun)
+        else:
+            state = _STEPS[name](state, settings)
+            timed(name, begun)
+    image, guarded = state.full.clamp(min=0), None
+    if settings.guard:
+        begun = time.perf_counter()
+        image, guarded = _guarded(first, state)
+        timed("guard", begun)
+    return Result(
+        image=frame.like_input(image),
+        network=core.network if core else None,
+        losses=core.losses if core else [],
+        seconds=seconds,
+        estimate=guarded.estimate if guarded else None,
+        aovs=_aovs(guarded) if guarded else {},
+        input_scale=first.scale,
+        start=core.start if core else Start(warm=False),
     )
 
 
-def _start(cold: Network, warm: Network, guides: tuple[Guides, Guides], settings: Settings) -> Start:
-    """Which of both networks fits the frame better before any training.
-
-    The network that is given has to be better by more than chance, its standard error over the sample's patches: a
-    frame that starts warm trains for fewer steps, and those would not be enough after a cut.
-    """
-    here = copy.deepcopy(cold)  # on the device of the guides
-    here.load_state_dict(warm.state_dict())
-    cold_losses, warm_losses = (starting_losses(network, guides, settings) for network in (cold, here))
-    gain = cold_losses - warm_losses
-    chance = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
-    return Start(float(gain.mean()) > chance, float(cold_losses.mean()), float(warm_losses.mean()))
+def _aovs(guarded: Guarded) -> dict[str, Tensor]:
+    return {"blend": guarded.alpha, "error.before": guarded.errors[0], "error.after": guarded.errors[1]}
 
 
 def _automatic_scale(frame: Frame) -> float:
@@ -188,39 +125,11 @@ def _automatic_scale(frame: Frame) -> float:
     return float(1 / roots**2) if roots > 0 else 1.0
 
 
-def _bounded(radiance: Tensor, scale: float) -> Tensor:
-    """Scaled, and bounded so that squares stay finite."""
-    return (radiance.double() * scale).clamp(max=LARGEST).float()
-
-
-def _aovs(guarded: Guarded) -> dict[str, Tensor]:
-    return {"blend": guarded.alpha, "error.before": guarded.errors[0], "error.after": guarded.errors[1]}
-
-
-def _finish(frame: Frame, network: Network, settings: Settings, scale: float) -> tuple[Tensor, Guarded | None]:
-    """The result from the trained network, in the frame's own units."""
-    assert frame.denoised is not None  # correct() has checked; tells the type checker
-    given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
-    color = (_bounded(frame.color[0], scale), _bounded(frame.color[1], scale))
-    denoised = (_bounded(frame.denoised[0], scale), _bounded(frame.denoised[1], scale))
-    full = _bounded(given, scale)
-
-    def corrected(shown: Tensor | None) -> tuple[Tensor, Tensor]:
-        a, b = (infer(network, half, settings, scale=scale, denoised=shown) for half in frame.halves)
-        return a, b
-
-    with_halves = corrected(None)
-    image = mean(with_halves)
-    if settings.inference == "full":
-        image += trust_in_full(denoised, full).to(image.dtype) * (mean(corrected(given)) - image)
-    image = image.clamp(min=0)
-    if not settings.guard:
-        return _unscaled(image, scale), None
-    guarded = guard(color, denoised, with_halves, full, image, scale=scale)
+def _guarded(first: State, last: State) -> tuple[Tensor, Guarded]:
+    """What the stages made of the frame, guarded against what the denoiser had."""
+    before, after = first.scaled(), last.scaled()
+    guarded = guard(before.color, before.images, after.images, before.full, after.full, scale=first.scale)
     if not guarded.estimate.improved:
-        return given, guarded
-    return _unscaled(keep_light(guarded.image, full, color), scale), guarded
-
-
-def _unscaled(image: Tensor, scale: float) -> Tensor:
-    return (image.double() / scale).clamp(0, torch.finfo(torch.float32).max).float()
+        return first.full, guarded
+    kept = keep_light(guarded.image, before.full, before.color)
+    return (kept.double() / first.scale).clamp(0, torch.finfo(torch.float32).max).float(), guarded

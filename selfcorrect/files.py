@@ -2,18 +2,20 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from selfcorrect import exr
 from selfcorrect.correct import Result
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
-from selfcorrect.frame import Frame
+from selfcorrect.frame import Frame, repaired
 from selfcorrect.settings import Settings
 
-__all__ = ["Loaded", "Sources", "load", "save"]
+__all__ = ["Images", "Loaded", "Sources", "load", "load_images", "save", "save_combined"]
 
 _FEATURES = ("albedo", "normal", "visibility", "depth")
 
@@ -113,6 +115,45 @@ def save(
     attributes = {"selfcorrect/settings": json.dumps(settings.to_dict()), "selfcorrect/run": json.dumps(dict(details))}
     names = loaded.source.taken["color"]
     return exr.write(path, loaded.source.file, result.image, names, attributes, extra=extra)
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Renders of one frame in memory.
+
+    Attributes:
+        images: (H, W, 3) float32 tensors of linear radiance, finite; a reconstructed one may be negative.
+        source: the first one as it was read.
+    """
+
+    images: tuple[Tensor, ...]
+    source: exr.Half
+
+
+def load_images(paths: Sequence[str]) -> Images:
+    """Read the colour of several renders of one frame.
+
+    Raises:
+        FileError: a file cannot be read, or the same file was given twice.
+        FrameError: sizes do not fit.
+    """
+    for i, path in enumerate(paths):
+        if any(path == other or _same_file(Path(path), Path(other)) for other in paths[:i]):
+            raise FileError(f"{path}: expected renders with seeds of their own, but got the same file twice")
+    first = exr.load_half(paths[0])
+    size = first.buffers["color"].shape[:2]
+    colors = [first.buffers["color"], *(_color_of(path, size) for path in paths[1:])]
+    return Images(tuple(repaired(color, path) for color, path in zip(colors, paths, strict=True)), first)
+
+
+def save_combined(path: str, images: Images, image: Tensor, *, details: Mapping[str, Any]) -> int:
+    """Write a combined colour under the names it had in the first render, with all else of that one.
+
+    Returns:
+        how many values lay beyond the range of half floats and were clipped, where the file holds those.
+    """
+    attributes = {"selfcorrect/combine": json.dumps(dict(details))}
+    return exr.write(path, images.source.file, image.cpu().numpy(), images.source.taken["color"], attributes)
 
 
 def _check_distinct(sources: Sources) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError
 
-__all__ = ["Frame", "Half", "Repairs", "mean"]
+__all__ = ["Frame", "Half", "Repairs", "mean", "repaired"]
 
 Pair = tuple[Any, Any]
 _CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 1, "depth": 1}
@@ -120,9 +120,14 @@ class Frame:
         """This frame with each half denoised on its own, with its own G-buffers.
 
         Args:
-            denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors.
-            full: also denoise the mean of the halves.
+            denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors; if its ``dual`` is True,
+                once as ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs of them.
+            full: also denoise the mean of the halves; with a dual denoiser it is the mean of the denoised halves.
         """
+        if getattr(denoiser, "dual", False):
+            features = {name: getattr(self, name) for name in ("albedo", "normal", "depth", "visibility")}
+            pair = denoiser.pair(self.color, **features)  # type: ignore[attr-defined]  # only a dual one has it
+            return self.with_denoised(pair, mean(pair) if full else None)
         inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
         pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
         if not full:
@@ -166,6 +171,15 @@ def mean(pair: Pair) -> Tensor:
     """Mean of both halves; in float64, as the sum of two large values may exceed float32."""
     average: Tensor = ((pair[0].double() + pair[1].double()) / 2).to(pair[0].dtype)
     return average
+
+
+def repaired(image: Any, what: str) -> Tensor:
+    """An (H, W, 3) array as float32, filled where it is not finite; negative values stay.
+
+    Raises:
+        FrameError: it has another shape or no floating-point numbers; ``what`` names it.
+    """
+    return _repair(_as_tensor(image, what, 3), radiance=False)[0]
 
 
 def _as_tensor(array: Any, what: str, channels: int) -> Tensor:

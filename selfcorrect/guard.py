@@ -219,14 +219,14 @@ def _smooth(image: Tensor) -> Tensor:
     return F.interpolate(means[None, None], size=image.shape, mode="bilinear")[0, 0]
 
 
-def trust_in_full(denoised: Pair, denoised_full: Tensor) -> Tensor:
+def trust_in_full(denoised: Pair, denoised_full: Tensor, *, scale: float = 1.0) -> Tensor:
     """How far the full buffer's denoised image may stand in for the halves' own, (H, W, 1), 0 … 1.
 
     It is the better input, but a firefly that the denoiser has left in one half is in the full buffer too; with their
     own images only one of the corrected halves has it. So not where the halves differ by more than a factor of three,
     unless the full buffer sides with the darker one.
     """
-    a, b, full = (image.double().mean(-1) for image in (*denoised, denoised_full))
+    a, b, full = (scale * image.double().mean(-1) for image in (*denoised, denoised_full))
     middle, half = (a + b) / 2, (a - b).abs() / 2
     left_in_one = half > _DISAGREEMENT * middle.clamp(min=_DARKEST / 10)
     sides_with_darker = (2 * (middle - full) / half.clamp(min=torch.finfo(torch.float64).tiny)).clamp(0, 1)

@@ -11,6 +11,7 @@ __all__ = ["Settings"]
 _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench_quality.py measures it"
 _WARM = "not in the paper; scripts/bench_shot.py measures it"
+_STAGES = "not in the paper; scripts/bench_stages.py measures it"
 
 
 def _setting(default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0) -> Any:
@@ -30,10 +31,20 @@ def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) ->
     expected, types = _KINDS[kind]
     if not isinstance(value, types) or (isinstance(value, bool) and kind is not bool):
         raise SettingsError(f"expected {expected} for the setting {name}, but got {value!r}")
-    if kind is str and value not in metadata["choices"]:
+    if kind is str and metadata["choices"] and value not in metadata["choices"]:
         raise SettingsError(f"expected {name} out of {', '.join(metadata['choices'])}, but got {value!r}")
     if isinstance(value, (int, float)) and not metadata["least"] <= value < float("inf"):
         raise SettingsError(f"expected {name} of at least {metadata['least']}, but got {value!r}")
+
+
+STAGES = ("regression", "core", "james-stein")
+
+
+def _check_stages(stages: str) -> None:
+    names = stages.split(",")
+    unknown = [name for name in names if name not in STAGES]
+    if unknown or len(set(names)) < len(names):
+        raise SettingsError(f"expected stages out of {','.join(STAGES)}, each at most once, but got {stages!r}")
 
 
 @dataclass(frozen=True)
@@ -44,6 +55,10 @@ class Settings:
         SettingsError: a value is out of range.
     """
 
+    stages: str = _setting("core", f"what runs, in this order, before the guard: out of {','.join(STAGES)}", _STAGES)
+    regression_stride: int = _setting(
+        2, "the stage regression solves a model at every so many-th pixel of as many rows", _STAGES, least=1
+    )
     combination: str = _setting(
         "eq10", "what the window's pixels are combined to", f"{_PAPER}, Table 1", choices=("eq10", "eq3")
     )
@@ -57,7 +72,6 @@ class Settings:
         f"{_PAPER}, published code",
         choices=("fp32", "bf16"),
     )
-    networks: int = _setting(1, "trained from other seeds; their outputs are averaged", f"{_PAPER}, Sec. 4", least=1)
     patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1)
     stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
@@ -101,10 +115,18 @@ class Settings:
     def __post_init__(self) -> None:
         for f in fields(self):
             _check(f.name, getattr(self, f.name), type(f.default), f.metadata)
+        _check_stages(self.stages)
+        if self.regression_stride > 16:
+            raise SettingsError(f"expected a regression_stride of at most 16, but got {self.regression_stride}")
         if self.window % 2 == 0 or self.window > 31:
             raise SettingsError(f"expected an odd window of at most 31, but got {self.window}")
         if not self.steps and self.stride > self.patch:
             raise SettingsError(f"expected a stride of at most the patch ({self.patch}), but got {self.stride}")
+
+    @property
+    def stage_names(self) -> tuple[str, ...]:
+        """What runs, in order."""
+        return tuple(self.stages.split(","))
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
@@ -116,10 +138,10 @@ class Settings:
         balanced = cls(
             patch=64,
             batch=4,
-            steps=200,
-            warm_steps=67,
-            learning_rate=2e-3,
-            warm_learning_rate=1e-3,
+            steps=400,
+            warm_steps=133,
+            learning_rate=1e-3,
+            warm_learning_rate=5e-4,
             rate_from_variance=False,
             schedule="cosine",
             gradient_limit=1.0,
@@ -133,8 +155,8 @@ class Settings:
         )
         return {
             "balanced": balanced,
-            "fast": replace(balanced, steps=60, warm_steps=30, learning_rate=4e-3, warm_learning_rate=2e-3),
-            "best": replace(balanced, networks=4),
+            "fast": replace(balanced, steps=100, warm_steps=50, learning_rate=3e-3, warm_learning_rate=1.5e-3),
+            "best": replace(balanced, batch=16),
             "paper": cls(),
         }
 

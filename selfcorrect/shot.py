@@ -110,9 +110,12 @@ class Job(NamedTuple):
 
 
 class Done(NamedTuple):
-    """A corrected frame: its network, and what writes it, which is called in another thread and returns a report."""
+    """A corrected frame: its network, and what writes it, which is called in another thread and returns a report.
 
-    network: Network
+    Stages without the core have no network, and nothing to go on from.
+    """
+
+    network: Network | None
     write: Callable[[], Any]
 
 
@@ -271,7 +274,7 @@ class _Run:
 
     def _write(self, frame: int, made: str, done: Done) -> Any:
         """In the writer's thread. The state comes first: there is no output whose successor could not go on from it."""
-        if self.habits.save_state is not None:
+        if self.habits.save_state is not None and done.network is not None:
             save_state(self._state_file(frame), State(done.network, frame, made), self.habits.settings)
         return done.write()
 

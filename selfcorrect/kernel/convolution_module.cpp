@@ -2,7 +2,7 @@
 // nothing is kept, pieces of them) are independent, and their weights' gradients are added in the patches' order, so
 // the result does not depend on the number of threads.
 
-#include "convolution_module.h"
+#include "bindings.h"
 
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
@@ -15,7 +15,7 @@
 #include <vector>
 
 #include "convolution.h"
-#include "processor.h"
+#include "pool.h"
 #if defined(SELFCORRECT_AMX)
 #include <cpuid.h>
 #include <sys/syscall.h>
@@ -42,14 +42,8 @@ bool has_amx() {
 }
 #endif
 
-std::vector<std::string> instruction_sets() {
-    std::vector<std::string> names{"baseline"};
-#if defined(SELFCORRECT_X86)
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) names.push_back("avx2");
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-        __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw"))
-        names.push_back("avx512");
-#endif
+std::vector<std::string> convolution_instruction_sets() {
+    auto names = selfcorrect::instruction_sets();
 #if defined(SELFCORRECT_AMX)
     static const bool amx = has_amx();
     if (amx) names.push_back("amx");
@@ -58,7 +52,7 @@ std::vector<std::string> instruction_sets() {
 }
 
 Convolution variant(const std::string& name) {
-    const auto names = instruction_sets();
+    const auto names = convolution_instruction_sets();
     if (std::find(names.begin(), names.end(), name) == names.end())
         throw std::invalid_argument("expected an instruction set this processor has, but got " + name);
 #if defined(SELFCORRECT_AMX)
@@ -188,7 +182,7 @@ std::int64_t kept_bytes(const std::string& instruction_set, int patches, int lay
 }  // namespace
 
 void bind_convolution(nb::module_& m) {
-    m.def("convolution_instruction_sets", &instruction_sets, "Names this processor can run, slowest first.");
+    m.def("convolution_instruction_sets", &convolution_instruction_sets, "Names this processor can run, slowest first.");
     m.def("convolution_kept_bytes", &kept_bytes, "Memory that the way back needs of the way forward.");
     m.def("convolution_peak",
           [](const std::string& instruction_set, std::int64_t rounds) { return variant(instruction_set).peak(rounds); },

@@ -1,19 +1,14 @@
 // Python's door to the kernel: checks nothing but types (kernel/__init__.py validates), releases the GIL, spreads
-// the rows over threads. Rows are independent, so the result does not depend on the number of threads.
+// the rows over threads.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#include <algorithm>
-#include <stdexcept>
-#include <string>
-#include <vector>
-
-#include "convolution_module.h"
+#include "bindings.h"
 #include "job.h"
-#include "processor.h"
+#include "pool.h"
 
 namespace nb = nanobind;
 using nb::ndarray;
@@ -27,37 +22,11 @@ using Sums = ndarray<double, nb::device::cpu, nb::c_contig>;
 
 namespace {
 
-std::vector<std::string> instruction_sets() {
-    std::vector<std::string> names{"baseline"};
-#if defined(SELFCORRECT_X86)
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) names.push_back("avx2");
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-        __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw"))
-        names.push_back("avx512");
-#endif
-    return names;
-}
-
-RowFunction row_function(const std::string& name) {
-    const auto names = instruction_sets();
-    if (std::find(names.begin(), names.end(), name) == names.end())
-        throw std::invalid_argument("expected an instruction set this processor has, but got " + name);
-#if defined(SELFCORRECT_X86)
-    if (name == "avx512") return selfcorrect::row_avx512;
-    if (name == "avx2") return selfcorrect::row_avx2;
-#endif
-    return selfcorrect::row_baseline;
-}
-
 void run(const Job& job, Mode mode, const std::string& instruction_set, int threads) {
-    const RowFunction row = row_function(instruction_set);
-    const std::int64_t rows = std::int64_t(job.patches) * job.height;
-    const std::int64_t workers = std::min<std::int64_t>(threads, rows);
+    const RowFunction row = SELFCORRECT_PICK(instruction_set, selfcorrect::row);
     nb::gil_scoped_release release;
-    std::vector<float> scratch(workers * selfcorrect::scratch_size(job.window));
-    selfcorrect::spread(rows, threads, [&](std::int64_t i, int worker) {
-        row(job, mode, i, scratch.data() + worker * selfcorrect::scratch_size(job.window));
-    });
+    selfcorrect::run_rows(std::int64_t(job.patches) * job.height, threads, selfcorrect::scratch_size(job.window),
+                          [&](std::int64_t i, float* scratch) { row(job, mode, i, scratch); });
 }
 
 Job make_job(const Array& planes, const Array& heads, const Corners& corners, int window, int every, bool albedo, bool normal,
@@ -91,7 +60,7 @@ void set_gradient(Job& job, const Array& gradient) {
 NB_MODULE(_cpu, m) {
     bind_convolution(m);
 
-    m.def("instruction_sets", &instruction_sets, "Names this processor can run, slowest first.");
+    m.def("instruction_sets", &selfcorrect::instruction_sets, "Names this processor can run, slowest first.");
 
     m.def("forward",
           [](Array planes, Array heads, Corners corners, int window, int every, bool albedo, bool normal, bool visibility,
@@ -121,4 +90,7 @@ NB_MODULE(_cpu, m) {
               set_gradient(job, gradient);
               run(job, Mode::loss, instruction_set, threads);
           });
+
+    bind_nlm(m);
+    bind_regression(m);
 }

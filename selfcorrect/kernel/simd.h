@@ -14,6 +14,11 @@
 #define SELFCORRECT_LANES 4
 #endif
 
+// name -> name_avx512, ...: an entry of the variant that is being compiled.
+#define SELFCORRECT_JOIN(name, suffix) name##suffix
+#define SELFCORRECT_JOIN_EXPANDED(name, suffix) SELFCORRECT_JOIN(name, suffix)
+#define SELFCORRECT_VARIANT(name) SELFCORRECT_JOIN_EXPANDED(name, SELFCORRECT_SUFFIX)
+
 namespace {
 
 constexpr int lanes = SELFCORRECT_LANES;
@@ -37,6 +42,8 @@ inline Float maximum(Float a, Float b) {
     return a > b ? a : b;
 #endif
 }
+
+inline Float minimum(Float a, Float b) { return -maximum(-a, -b); }
 
 // 2^x for x <= 0; below 2^-126 the result is 0. Relative error 8e-8 (degree-5 minimax on [0, 1]).
 inline Float exp2_nonpositive(Float x) {

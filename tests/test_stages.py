@@ -1,0 +1,111 @@
+"""Composition: any order, what is recorded, what a half may know, and what is refused."""
+
+import importlib
+
+import pytest
+import torch
+from torch import Tensor
+
+import denoisers
+from selfcorrect import Frame, Settings, correct
+from selfcorrect.errors import FrameError, SettingsError
+from selfcorrect.frame import Half, mean
+from selfcorrect.guard import Guarded
+from selfcorrect.stages import steps
+from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
+from selfcorrect.stages.steps import State
+
+SMALL = {"patch": 16, "batch": 2, "steps": 2, "window": 5, "layers": 3, "regression_stride": 4}
+
+
+def make_frame(size: tuple[int, int] = (40, 44), sigma: float = 0.3) -> Frame:
+    generator = torch.Generator().manual_seed(0)
+    y, x = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
+    albedo = (0.5 + 0.3 * torch.sin(x / 2))[..., None].expand(*size, 3).contiguous()
+    truth = albedo * (1 + 0.5 * torch.sin(y / 9))[..., None]
+    color = tuple(truth * (1 + sigma * torch.randn(*size, 3, generator=generator)) for _ in "ab")
+    return Frame(color=color, albedo=(albedo, albedo.clone())).denoise(denoisers.create("box"))
+
+
+def settings(**changes: object) -> Settings:
+    return Settings.preset("balanced", **SMALL | changes)
+
+
+@pytest.mark.parametrize("stages", ["core", "james-stein", "regression", "regression,core,james-stein"])
+@pytest.mark.parametrize("guard", [True, False])
+def test_compositions_run(stages: str, guard: bool) -> None:
+    chosen = settings(stages=stages, guard=guard)
+    result = correct(make_frame(), chosen)
+    assert result.image.isfinite().all()
+    assert (result.network is not None) == ("core" in stages)
+    assert (result.estimate is not None) == guard
+    ran = [{"train": "core"}.get(name, name) for name in result.seconds if name not in ("infer", "guard")]
+    assert ran == list(chosen.stage_names)
+    assert Settings.from_dict(chosen.to_dict()).stages == stages
+
+
+def test_the_order_counts() -> None:
+    frame = make_frame()
+    one, other = (
+        correct(frame, settings(stages=stages, guard=False)).image
+        for stages in ("regression,james-stein", "james-stein,regression")
+    )
+    assert not torch.equal(one, other)
+
+
+def test_james_stein_alone_is_the_combiner() -> None:
+    frame = make_frame()
+    got = correct(frame, settings(stages="james-stein", guard=False, input_scale=1.0)).image
+    noisy = mean(frame.color)
+    expected = james_stein(noisy, frame.denoised_full, variance_of_mean(frame.color), relative_weight(noisy))
+    torch.testing.assert_close(got, expected.clamp(min=0))
+
+
+def test_the_guard_compares_with_what_the_denoiser_gave(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not with what an earlier stage made of it."""
+    module = importlib.import_module("selfcorrect.correct")  # the package has a function of this name
+
+    seen: list[tuple[Tensor, ...]] = []
+    real = module.guard
+
+    def spy(*arguments: object, scale: float) -> Guarded:
+        seen.append(arguments)
+        return real(*arguments, scale=scale)
+
+    monkeypatch.setattr(module, "guard", spy)
+    frame = make_frame()
+    correct(frame, settings(stages="regression,james-stein", input_scale=1.0))
+    ((color, denoised, corrected, full, _),) = seen
+    assert torch.equal(denoised[0], frame.denoised[0])
+    assert torch.equal(full, frame.denoised_full)
+    assert torch.equal(color[1], frame.color[1])
+    assert not torch.equal(corrected[0], denoised[0])
+
+
+@pytest.mark.parametrize("stages", ["", "core,", "cor", "core,core", "core;james-stein"])
+def test_wrong_stages_are_named(stages: str) -> None:
+    with pytest.raises(SettingsError, match="regression,core,james-stein"):
+        settings(stages=stages)
+
+
+def test_warm_start_without_core_is_refused() -> None:
+    network = correct(make_frame(), settings()).network
+    with pytest.raises(FrameError, match="core"):
+        correct(make_frame(), settings(stages="regression"), warm_start=network)
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_a_james_stein_half_knows_little_of_its_witness(heavy: bool) -> None:
+    """Covariance of half a with half b's noise over its variance: through the smoothed variance alone."""
+    generator = torch.Generator().manual_seed(0)
+    size, shares = (128, 128, 3), []
+    for _ in range(4):
+        errors = [torch.randn(size, generator=generator) for _ in "ab"]
+        if heavy:
+            errors = [0.2 * (torch.exp(1.5 * e) - 3.08) for e in errors]  # log-normal, mean 0
+        halves = [Half(10 + e, torch.full(size, 9.5), None, None, None, None) for e in errors]
+        state = steps.james_stein(State((halves[0], halves[1]), torch.full(size, 9.5)), settings())
+        images = state.images
+        for i in (0, 1):
+            shares.append(float(((images[i] - 10) * errors[1 - i]).mean() / errors[1 - i].var()))
+    assert abs(sum(shares) / len(shares)) < 0.005, shares
