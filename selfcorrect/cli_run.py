@@ -146,6 +146,17 @@ class Runner:
         start = time.perf_counter()
         began = start if began is None else began
         seconds = {"read": start - began}
+        frame, denoiser = self.prepare(loaded, seconds)
+        with _Progress(meanwhile) as progress:
+            result = correct(frame.to(self._options.device), self.settings, warm_start=network, progress=progress)
+        return Corrected(frame, result, denoiser, began, seconds)
+
+    def prepare(self, loaded: files.Loaded, seconds: dict[str, float]) -> tuple[Frame, str]:
+        """Denoise a frame where that is to be done, and tell of it; ``seconds`` is added to.
+
+        Returns:
+            The frame with its denoised halves, and who denoised it.
+        """
         if loaded.taken != self._taken:  # of a shot, only where it changes
             for role, names in loaded.taken.items():
                 log(f"{role}: {', '.join(names)}")
@@ -156,9 +167,7 @@ class Runner:
         for name, repairs in frame.repairs.items():
             if any(repairs):
                 log(f"{name}: {repairs.non_finite} pixels were NaN or infinite, {repairs.negative} negative; repaired")
-        with _Progress(meanwhile) as progress:
-            result = correct(frame.to(self._options.device), self.settings, warm_start=network, progress=progress)
-        return Corrected(frame, result, denoiser, began, seconds)
+        return frame, denoiser
 
     def write(self, output: str, loaded: files.Loaded, corrected: Corrected, more: Mapping[str, Any]) -> dict[str, Any]:
         """Write a frame; returns what --json prints. ``more`` is kept in the output's attribute, too."""
