@@ -31,6 +31,7 @@ __all__ = [
     "recommended",
     "sweep",
     "table",
+    "warm_up",
 ]
 
 Judge = Callable[[Result], tuple[float, float]]
@@ -186,7 +187,7 @@ def sweep(
     Raises:
         FrameError: a point starts warm, but there is no frame before.
     """
-    correct(_corner(frame), Settings.preset("paper", epochs=1))  # the first call of a process is slower
+    warm_up(frame)
     for one in tried:
         if one.warm and previous is None:
             raise FrameError(f"expected the frame before for the point {one.name!r}, but got none")
@@ -196,10 +197,14 @@ def sweep(
         yield Measurement(one, ratio, error, result.seconds["train"], result.seconds["infer"], result.start.warm)
 
 
-def _corner(frame: Frame) -> Frame:
+def warm_up(frame: Frame) -> None:
+    """Correct a corner of a frame, for nothing: the first call of a process is slower than those to be timed."""
     buffers = {name: getattr(frame, name) for name in Half._fields}
     side = _WARM_UP_SIDE
-    return Frame(**{n: (p[0][:side, :side], p[1][:side, :side]) for n, p in buffers.items() if p is not None})
+    corner = Frame(**{n: (p[0][:side, :side], p[1][:side, :side]) for n, p in buffers.items() if p is not None})
+    for name, settings in Settings.presets().items():
+        short = {"steps": 1} if settings.steps else {"epochs": 1}
+        correct(corner, Settings.preset(name, **short))
 
 
 def over_frames(measurements: Sequence[Measurement]) -> Measurement:
@@ -270,6 +275,8 @@ def plot(measurements: Sequence[Measurement], error: str, *, title: str = "") ->
     front = pareto_front(measurements)
     for chosen, style in ((False, {"color": "0.6", "markersize": 4}), (True, {"color": "C3", "markersize": 8})):
         those = [m for m in measurements if m.point.preset is chosen]
+        if not those:
+            continue
         errors = [m.standard_error if math.isfinite(m.standard_error) else 0.0 for m in those]
         axes.errorbar(
             [m.seconds for m in those],
@@ -287,6 +294,8 @@ def plot(measurements: Sequence[Measurement], error: str, *, title: str = "") ->
             where: Any = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 9 if m.point.preset else 7}
             axes.annotate(m.point.name, (m.seconds, m.ratio), **where)
     axes.set(xscale="log", xlabel="seconds of the correction", ylabel=error, title=title)
+    for ticks in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        ticks("{x:g}")
     axes.legend()
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=120)
