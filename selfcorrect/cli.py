@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NoReturn
 
-from selfcorrect import cli_sequence, exr, files, metrics
+from selfcorrect import cli_bench, cli_sequence, exr, files, metrics
 from selfcorrect.cli_run import EndOnInterrupt, Runner, add_run_flags, answer, log, mapping
 from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
@@ -57,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     frame.set_defaults(run=_frame)
 
     cli_sequence.add(commands)
+    cli_bench.add(commands)
 
     inspect = commands.add_parser("inspect", help="which channels a file has, and which would be used for what")
     inspect.add_argument("file", metavar="FILE.exr")

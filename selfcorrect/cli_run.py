@@ -163,6 +163,23 @@ class Runner:
         start = time.perf_counter()
         began = start if began is None else began
         seconds = {"read": start - began}
+        frame, denoiser = self.prepare(loaded, seconds)
+        with _Progress(meanwhile) as progress:
+            result = correct(
+                frame.to(self._options.device),
+                self._left(time.perf_counter() - began, frame),
+                warm_start=network,
+                progress=progress,
+                stop=stop,
+            )
+        return Corrected(frame, result, denoiser, began, seconds)
+
+    def prepare(self, loaded: files.Loaded, seconds: dict[str, float]) -> tuple[Frame, str]:
+        """Denoise a frame where that is to be done, and tell of it; ``seconds`` is added to.
+
+        Returns:
+            The frame with its denoised halves, and who denoised it.
+        """
         if loaded.taken != self._taken:  # of a shot, only where it changes
             for role, names in loaded.taken.items():
                 log(f"{role}: {', '.join(names)}")
@@ -173,15 +190,7 @@ class Runner:
         for name, repairs in frame.repairs.items():
             if any(repairs):
                 log(f"{name}: {repairs.non_finite} pixels were NaN or infinite, {repairs.negative} negative; repaired")
-        with _Progress(meanwhile) as progress:
-            result = correct(
-                frame.to(self._options.device),
-                self._left(time.perf_counter() - began, frame),
-                warm_start=network,
-                progress=progress,
-                stop=stop,
-            )
-        return Corrected(frame, result, denoiser, began, seconds)
+        return frame, denoiser
 
     def _left(self, spent: float, frame: Frame) -> Settings:
         """The settings with what is left of the time budget after reading and denoising, and for writing."""

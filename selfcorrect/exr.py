@@ -195,15 +195,15 @@ def _writable(name: str, part: Part) -> Any:
     return value
 
 
-def check_target(path: str | Path) -> Path:
+def check_target(path: str | Path, suffix: str = ".exr") -> Path:
     """The file to write, with links resolved so that a link stays one; to be called before long work.
 
     Raises:
         FileError: it cannot be written.
     """
     target = Path(os.path.realpath(path))
-    if target.suffix.lower() != ".exr":
-        raise FileError(f"{path}: expected an output whose name ends in .exr, but got '{target.name}'")
+    if target.suffix.lower() != suffix:
+        raise FileError(f"{path}: expected an output whose name ends in {suffix}, but got '{target.name}'")
     if os.path.isdir(target):
         raise FileError(f"{path}: expected a file to write, but got a folder; add a file name")
     if not os.path.isdir(target.parent):
