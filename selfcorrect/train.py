@@ -3,7 +3,7 @@
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +15,7 @@ from selfcorrect.network import Network
 from selfcorrect.patches import batches, steps_count
 from selfcorrect.settings import Settings
 
-__all__ = ["Limits", "Progress", "starting_losses", "train"]
+__all__ = ["Adam", "Limits", "Progress", "starting_losses", "train"]
 
 Progress = Callable[[int, int, float], None]
 
@@ -23,6 +23,46 @@ _WARM_UP = 20  # steps over which the cosine schedule reaches its rate
 _SHORTEST_ROUND = 0.5  # of the time that the steps took before: less is not worth beginning again for
 _LEAST_GAIN = 0.001  # of Eq. 8, most of which is noise that no network can take away
 _SAMPLE = 4  # rows and columns of patches that tell how well a network starts
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015) with a bound on the gradient's norm, on all parameters as one vector.
+
+    ``torch.optim`` has the same; importing what it needs takes a second, as long as some frames.
+
+    Args:
+        parameters: to be optimised.
+        epsilon: added to the root of the second moment.
+        limit: largest norm of the gradient.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], epsilon: float, limit: float):
+        self._parameters = list(parameters)
+        self._epsilon, self._limit = epsilon, limit
+        self._first = torch.zeros(sum(p.numel() for p in self._parameters), device=self._parameters[0].device)
+        self._second = torch.zeros_like(self._first)
+        self._steps = 0
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """One step down the gradients, which are taken away; none where they are not finite."""
+        gradient = torch.cat(
+            [torch.zeros_like(p).flatten() if p.grad is None else p.grad.flatten() for p in self._parameters]
+        )
+        for parameter in self._parameters:
+            parameter.grad = None
+        norm = float(gradient.norm())
+        if not math.isfinite(norm):
+            return
+        gradient *= min(1.0, self._limit / (norm + 1e-6))
+        self._steps += 1
+        self._first.lerp_(gradient, 0.1)
+        self._second.mul_(0.999).addcmul_(gradient, gradient, value=0.001)
+        root = (self._second / (1 - 0.999**self._steps)).sqrt_().add_(self._epsilon)
+        change = (self._first / root).mul_(rate / (1 - 0.9**self._steps))
+        sizes = [p.numel() for p in self._parameters]
+        for parameter, part in zip(self._parameters, change.split(sizes), strict=True):
+            parameter.sub_(part.view_as(parameter))
 
 
 @dataclass(frozen=True)
@@ -81,7 +121,7 @@ def _round(
     """The settings' steps, or as many as there is time for; the schedule's end is reached in either case."""
     weights = _weights(guides, settings)
     size = (settings.patch, settings.patch)
-    optimiser = torch.optim.Adam(network.parameters(), eps=settings.adam_epsilon, fused=True)
+    optimiser = Adam(network.parameters(), settings.adam_epsilon, settings.gradient_limit or math.inf)
     rate = learning_rate(guides, settings)
     steps = steps_count((guides[0].height, guides[0].width), settings)
     losses: list[float] = []
@@ -92,13 +132,9 @@ def _round(
             break
         batch = [patch for half in guides for patch in half.views(corners, size)]
         loss = dual_buffer_loss(network(batch), corners, guides, weights, settings)
-        optimiser.zero_grad()
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_limit or math.inf)
-        for group in optimiser.param_groups:
-            group["lr"] = rate * _schedule(len(losses), done, settings)
-        if bool(norm.isfinite()) and bool(loss.isfinite()):
-            optimiser.step()
+        if bool(loss.isfinite()):
+            optimiser.step(rate * _schedule(len(losses), done, settings))
         losses.append(float(loss.detach()))
         if progress is not None:
             progress(len(losses), steps, losses[-1])
