@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from selfcorrect.errors import FrameError
@@ -73,6 +74,20 @@ class Traits(NamedTuple):
         Traits(self.buffers, *own).check(self)
 
 
+class _Convolution(nn.Module):
+    """3×3 with zero padding. torch's own would draw its first weights from the caller's random numbers."""
+
+    def __init__(self, inputs: int, outputs: int, generator: torch.Generator):
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(outputs, inputs, 3, 3))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        nn.init.xavier_uniform_(self.weight, generator=generator)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, h, w) to (N, outputs, h, w)."""
+        return F.conv2d(x, self.weight, self.bias, padding=1)
+
+
 class Network(nn.Module):
     """Convolutions 3×3 with ReLU between them, zero padding, Glorot-uniform weights and zero biases.
 
@@ -95,11 +110,7 @@ class Network(nn.Module):
         self.precision = settings.precision
         self.convolutions = nn.ModuleList()
         for i, o in pairwise(widths):
-            # skip_init: torch's own first weights would draw from the caller's random numbers
-            layer = nn.utils.skip_init(nn.Conv2d, i, o, 3, padding=1)
-            nn.init.xavier_uniform_(layer.weight, generator=generator)
-            nn.init.zeros_(layer.bias)
-            self.convolutions.append(layer)
+            self.convolutions.append(_Convolution(i, o, generator))
 
     @classmethod
     def for_guides(cls, guides: Guides, settings: Settings, generator: torch.Generator) -> "Network":
@@ -117,8 +128,7 @@ class Network(nn.Module):
         present = {"albedo": guides.has_albedo, "normal": guides.has_normal, "visibility": guides.has_visibility}
         gammas = [value for name, value in _START_GAMMA.items() if present.get(name, True)]
         last = self.convolutions[-1]
-        assert isinstance(last, nn.Conv2d)
-        assert last.bias is not None
+        assert isinstance(last, _Convolution)
         with torch.no_grad():
             last.weight.mul_(_START_SPREAD)
             last.bias.copy_(torch.tensor([*betas, *(math.log(math.expm1(value)) for value in (*gammas, _START_TAU))]))

@@ -50,7 +50,7 @@ def test_network_has_20303_parameters() -> None:
 
 def test_glorot_uniform_weights_and_zero_biases() -> None:
     for convolution in make_network(full_guides()).convolutions:
-        fan = 9 * (convolution.in_channels + convolution.out_channels)
+        fan = 9 * sum(convolution.weight.shape[:2])
         bound = math.sqrt(6 / fan)
         weight = convolution.weight.detach()
         assert weight.abs().max() <= bound
