@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from selfcorrect.bands import average, bands, tile_means
 from selfcorrect.errors import FrameError
 from selfcorrect.frame import Frame, Half, mean
-from selfcorrect.guard import Estimate, Guarded, guard, keep_light, trust_in_full
-from selfcorrect.infer import infer, infer_tile
+from selfcorrect.guard import Estimate, Evidence, guard, keep_light, trust_in_full
+from selfcorrect.infer import TILE, infer, infer_tile
 from selfcorrect.kernel import LARGEST, Guides
 from selfcorrect.network import Network
 from selfcorrect.patches import crops, overhang
@@ -113,8 +114,7 @@ def correct(
     losses = train(network, guides, _warm(settings) if start.warm else settings, generator, progress, limits)
     del guides
     trained = time.perf_counter()
-    image, guarded = _finish(frame, network, settings, scale)
-    estimate, aovs = (guarded.estimate, _aovs(guarded)) if guarded else (None, {})
+    image, estimate, aovs = _finish(frame, network, settings, scale)
     seconds = {"train": trained - began, "infer": time.perf_counter() - trained}
     return Result(frame.like_input(image), network, losses, seconds, estimate, aovs, scale, start)
 
@@ -183,44 +183,65 @@ def _start(cold: Network, warm: Network, guides: tuple[Guides, Guides], settings
 
 def _automatic_scale(frame: Frame) -> float:
     """What brings the denoised frame's mean near 1; by the mean of roots, which a few bright pixels do not move."""
-    assert frame.denoised is not None
-    roots = torch.stack(frame.denoised).double().mean(-1).clamp(min=0).sqrt().mean()
-    return float(1 / roots**2) if roots > 0 else 1.0
+    denoised = frame.denoised
+    assert denoised is not None  # correct() has checked; tells the type checker
+
+    def roots(rows: slice) -> Tensor:
+        return torch.stack([half[rows].double().mean(-1).clamp(min=0).sqrt() for half in denoised])
+
+    root = sum(average(tile_means(frame.size[0], roots), frame.size)) / 2
+    return 1 / root**2 if root > 0 else 1.0
 
 
-def _bounded(radiance: Tensor, scale: float) -> Tensor:
-    """Scaled, and bounded so that squares stay finite."""
-    return (radiance.double() * scale).clamp(max=LARGEST).float()
+class _Scaled:
+    """An image times a factor, bounded so that squares stay finite; made where it is read, never whole."""
+
+    def __init__(self, image: Tensor, factor: float):
+        self.shape = image.shape
+        self._image, self._factor = image, factor
+
+    def __getitem__(self, rows: slice) -> Tensor:
+        return (self._image[rows].double() * self._factor).clamp(max=LARGEST).float()
 
 
-def _aovs(guarded: Guarded) -> dict[str, Tensor]:
-    return {"blend": guarded.alpha, "error.before": guarded.errors[0], "error.after": guarded.errors[1]}
-
-
-def _finish(frame: Frame, network: Network, settings: Settings, scale: float) -> tuple[Tensor, Guarded | None]:
-    """The result from the trained network, in the frame's own units."""
+def _finish(
+    frame: Frame, network: Network, settings: Settings, scale: float
+) -> tuple[Tensor, Estimate | None, dict[str, Tensor]]:
+    """The result from the trained network, in the frame's own units, with the guard's estimate and maps."""
     assert frame.denoised is not None  # correct() has checked; tells the type checker
     given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
-    color = (_bounded(frame.color[0], scale), _bounded(frame.color[1], scale))
-    denoised = (_bounded(frame.denoised[0], scale), _bounded(frame.denoised[1], scale))
-    full = _bounded(given, scale)
+    (ya, yb), (za, zb) = ([_Scaled(half, scale) for half in pair] for pair in (frame.color, frame.denoised))
+    full = _Scaled(given, scale)
+    evidence = Evidence((ya, yb), (za, zb)) if settings.guard else None
+    image = torch.empty_like(given)
+    for rows in bands(frame.size[0], TILE):
+        corrected = _corrected(frame, network, settings, scale, rows)
+        image[rows] = mean(corrected)
+        if settings.inference == "full":
+            with_full = mean(_corrected(frame, network, settings, scale, rows, given))
+            image[rows] += trust_in_full((za, zb), full, rows).to(image.dtype) * (with_full - image[rows])
+        if evidence is not None:
+            evidence.add(rows, corrected)
+    image.clamp_(min=0)
+    if evidence is None:
+        return _unscaled(image, scale), None, {}
+    guarded = guard(evidence, full, image, scale=scale)
+    del evidence
+    image = _unscaled(keep_light(image, full, (ya, yb)), scale) if guarded.estimate.improved else image.copy_(given)
+    alpha, before, after = guarded.maps()
+    return image, guarded.estimate, {"blend": alpha, "error.before": before, "error.after": after}
 
-    def corrected(shown: Tensor | None) -> tuple[Tensor, Tensor]:
-        a, b = (infer(network, half, settings, scale=scale, denoised=shown) for half in frame.halves)
-        return a, b
 
-    with_halves = corrected(None)
-    image = mean(with_halves)
-    if settings.inference == "full":
-        image += trust_in_full(denoised, full).to(image.dtype) * (mean(corrected(given)) - image)
-    image = image.clamp(min=0)
-    if not settings.guard:
-        return _unscaled(image, scale), None
-    guarded = guard(color, denoised, with_halves, full, image, scale=scale)
-    if not guarded.estimate.improved:
-        return given, guarded
-    return _unscaled(keep_light(guarded.image, full, color), scale), guarded
+def _corrected(
+    frame: Frame, network: Network, settings: Settings, scale: float, rows: slice, denoised: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Rows of both corrected halves."""
+    a, b = (infer(network, half, settings, scale=scale, denoised=denoised, rows=rows) for half in frame.halves)
+    return a, b
 
 
 def _unscaled(image: Tensor, scale: float) -> Tensor:
-    return (image.double() / scale).clamp(0, torch.finfo(torch.float32).max).float()
+    """In the frame's own units, in place."""
+    for rows in bands(image.shape[0]):
+        image[rows] = (image[rows].double() / scale).clamp(0, torch.finfo(torch.float32).max)
+    return image

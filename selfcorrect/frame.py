@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from selfcorrect.bands import bands
 from selfcorrect.errors import FrameError
 
 __all__ = ["Frame", "Half", "Repairs", "mean"]
@@ -164,7 +165,9 @@ class Frame:
 
 def mean(pair: Pair) -> Tensor:
     """Mean of both halves; in float64, as the sum of two large values may exceed float32."""
-    average: Tensor = ((pair[0].double() + pair[1].double()) / 2).to(pair[0].dtype)
+    average: Tensor = torch.empty_like(pair[0])
+    for rows in bands(len(average)):
+        average[rows] = (pair[0][rows].double() + pair[1][rows].double()) / 2
     return average
 
 
