@@ -5,7 +5,7 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NoReturn
@@ -82,19 +82,20 @@ def _frame(options: argparse.Namespace) -> None:
     sources = files.Sources(
         options.a, options.b, options.denoised_a, options.denoised_b, options.denoised, mapping(options)
     )
-    report, _ = _run(options, sources, options.output)
+    report = _run(options, sources, options.output)
     if options.json:
         answer(report)
 
 
-def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tuple[dict[str, Any], Frame]:
-    """Correct one frame from files to file; returns what --json prints, and the frame."""
+def _run(
+    options: argparse.Namespace, sources: files.Sources, output: str, show: Callable[[Frame], None] | None = None
+) -> dict[str, Any]:
+    """Correct one frame from files to file; returns what --json prints. ``show`` is called with the denoised frame."""
     start = time.perf_counter()
     runner = Runner(options, given=sources.denoised_a is not None)
     remove_abandoned(exr.check_target(output).parent)
-    loaded = files.load(sources)
-    corrected = runner.correct(loaded, began=start)
-    return runner.write(output, loaded, corrected, {}), corrected.frame
+    corrected = runner.correct(files.load(sources), began=start, show=show)
+    return runner.write(output, corrected, {})
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -134,7 +135,9 @@ def _demo(options: argparse.Namespace) -> None:
             name: str(data / f"demo_{name}.exr") for name in ("064spp_A", "064spp_B", "ref_A", "ref_B", "ref_smooth")
         }
         sources = files.Sources(names["064spp_A"], names["064spp_B"], mapping=mapping(options))
-        report, frame = _run(options, sources, str(folder / "corrected.exr"))
+        frames: list[Frame] = []
+        report = _run(options, sources, str(folder / "corrected.exr"), frames.append)
+        frame = frames[0]
         color = [exr.load_half(names[n]).buffers["color"] for n in ("ref_A", "ref_B", "ref_smooth")]
         images = {
             "noisy": (frame.color[0] + frame.color[1]) / 2,

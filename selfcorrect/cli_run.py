@@ -89,17 +89,19 @@ def _use_machine(options: argparse.Namespace) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """A frame in memory, corrected.
+    """What is left of a frame that was corrected: not its buffers.
 
     Attributes:
-        frame: it, with its denoised halves.
+        origin: its half a.
+        facts: what --json tells of it.
         result: the correction.
         denoiser: who denoised it.
         began: when the work on it began, by ``time.perf_counter``.
         seconds: how long the stages before the correction took.
     """
 
-    frame: Frame
+    origin: files.Origin
+    facts: dict[str, Any]
     result: Result
     denoiser: str
     began: float
@@ -141,26 +143,30 @@ class Runner:
         meanwhile: Callable[[], None] | None = None,
         *,
         began: float | None = None,
+        show: Callable[[Frame], None] | None = None,
     ) -> Corrected:
-        """Denoise and correct a frame; ``meanwhile`` is called after every step."""
+        """Denoise and correct a frame; ``meanwhile`` is called after every step, ``show`` with the denoised frame."""
         start = time.perf_counter()
         began = start if began is None else began
         seconds = {"read": start - began}
-        if loaded.taken != self._taken:  # of a shot, only where it changes
-            for role, names in loaded.taken.items():
+        taken = loaded.origin.taken
+        if taken != self._taken:  # of a shot, only where it changes
+            for role, names in taken.items():
                 log(f"{role}: {', '.join(names)}")
-        self._taken = loaded.taken
+        self._taken = taken
         for doubt in doubts(loaded.frame):
             log(f"warning: {doubt}")
         frame, denoiser = _denoised(self._options, loaded.frame, self._denoise, seconds)
         for name, repairs in frame.repairs.items():
             if any(repairs):
                 log(f"{name}: {repairs.non_finite} pixels were NaN or infinite, {repairs.negative} negative; repaired")
+        if show is not None:
+            show(frame)
         with _Progress(meanwhile) as progress:
             result = correct(frame.to(self._options.device), self.settings, warm_start=network, progress=progress)
-        return Corrected(frame, result, denoiser, began, seconds)
+        return Corrected(loaded.origin, _facts(frame, result), result, denoiser, began, seconds)
 
-    def write(self, output: str, loaded: files.Loaded, corrected: Corrected, more: Mapping[str, Any]) -> dict[str, Any]:
+    def write(self, output: str, corrected: Corrected, more: Mapping[str, Any]) -> dict[str, Any]:
         """Write a frame; returns what --json prints. ``more`` is kept in the output's attribute, too."""
         written = time.perf_counter()
         result = corrected.result
@@ -174,7 +180,7 @@ class Runner:
             **more,
         }
         extra = _extra(self._options, result)
-        clipped = files.save(output, loaded, result, settings=self.settings, details=details, extra=extra)
+        clipped = files.save(output, corrected.origin, result, settings=self.settings, details=details, extra=extra)
         lines = [] if result.estimate is None else [str(result.estimate)]
         if clipped:
             lines.append(f"{output}: {clipped} values beyond the range of half floats were clipped")
@@ -186,9 +192,9 @@ class Runner:
             "output": output,
             "settings": self.settings.to_dict(),
             **details,
-            "channels": loaded.taken,
+            "channels": corrected.origin.taken,
             "seconds": {name: round(value, 3) for name, value in seconds.items()},
-            **_facts(corrected.frame, result),
+            **corrected.facts,
         }
 
 

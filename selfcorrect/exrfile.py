@@ -154,7 +154,10 @@ def _bytes(file: str) -> bytes:
     """The whole file, or its first bytes where they show that it is something else, however large."""
     with open(file, "rb") as stream:
         start = stream.read(len(exrheader.MAGIC))
-        return start + stream.read() if start == exrheader.MAGIC else start
+        if start != exrheader.MAGIC:
+            return start
+        stream.seek(0)
+        return stream.read()
 
 
 def _part(part: Any, header: exrheader.Header) -> Part:

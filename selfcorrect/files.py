@@ -5,7 +5,10 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
 
 from selfcorrect import exr
 from selfcorrect.correct import Result
@@ -13,7 +16,7 @@ from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsErro
 from selfcorrect.frame import Frame
 from selfcorrect.settings import Settings
 
-__all__ = ["Loaded", "Sources", "load", "save"]
+__all__ = ["Loaded", "Origin", "Sources", "load", "save"]
 
 _FEATURES = ("albedo", "normal", "visibility", "depth")
 
@@ -39,19 +42,32 @@ class Sources:
     mapping: Mapping[str, str] | None = None
 
 
+@dataclass(frozen=True)
+class Origin:
+    """The file of half a, whose pixels are not kept: what passes through is read again when it is written.
+
+    Attributes:
+        path: the file, with its layer.
+        taken: role → channel names.
+        stamp: what tells whether it has changed since.
+    """
+
+    path: str
+    taken: dict[str, list[str]]
+    stamp: tuple[int, int, int]
+
+
 @dataclass(frozen=True, eq=False)
 class Loaded:
     """A frame in memory, and where it came from.
 
     Attributes:
         frame: its buffers; without denoised halves where the files hold none.
-        source: half a as it was read.
-        taken: role → channel names of half a.
+        origin: half a.
     """
 
     frame: Frame
-    source: exr.Half
-    taken: dict[str, list[str]]
+    origin: Origin
 
 
 def load(sources: Sources) -> Loaded:
@@ -63,8 +79,8 @@ def load(sources: Sources) -> Loaded:
         FrameError: sizes do not fit.
     """
     _check_distinct(sources)
-    half_a = exr.load_half(sources.a, mapping=sources.mapping)
-    half_b = exr.load_half(sources.b, mapping=sources.mapping)
+    stamp = _stamp(sources.a)
+    half_a, half_b = (_half(path, sources.mapping) for path in (sources.a, sources.b))
     height, width = half_a.buffers["color"].shape[:2]
     if half_b.buffers["color"].shape[:2] != (height, width):
         other = half_b.buffers["color"].shape
@@ -87,12 +103,33 @@ def load(sources: Sources) -> Loaded:
         taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
     if sources.denoised:
         pairs["denoised_full"] = _color_of(sources.denoised, (height, width))
-    return Loaded(Frame(**pairs), half_a, taken)
+    return Loaded(Frame(**pairs), Origin(sources.a, taken, stamp))
+
+
+class _Half(NamedTuple):
+    """What is kept of a half: tensors, which the frame takes over without a copy."""
+
+    buffers: dict[str, Tensor]
+    taken: dict[str, list[str]]
+
+
+def _half(path: str, mapping: Mapping[str, str] | None = None) -> _Half:
+    half = exr.load_half(path, mapping=mapping)
+    return _Half({role: torch.from_numpy(buffer) for role, buffer in half.buffers.items()}, half.taken)
+
+
+def _stamp(path: str) -> tuple[int, int, int]:
+    file = path.partition("::")[0]
+    try:
+        found = os.stat(file)
+    except OSError as error:
+        raise FileError(f"{file}: expected an OpenEXR file, but got: {error.strerror}") from None
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def save(
     path: str,
-    loaded: Loaded,
+    origin: Origin,
     result: Result,
     *,
     settings: Settings,
@@ -103,10 +140,15 @@ def save(
 
     Returns:
         how many values lay beyond the range of half floats and were clipped, where the file holds those.
+
+    Raises:
+        FileError: half a has changed since it was read, or the output cannot be written.
     """
+    if _stamp(origin.path) != origin.stamp:
+        raise FileError(f"{origin.path}: expected the file that was read, but got one changed since; run again")
     attributes = {"selfcorrect/settings": json.dumps(settings.to_dict()), "selfcorrect/run": json.dumps(dict(details))}
-    names = loaded.source.taken["color"]
-    return exr.write(path, loaded.source.file, result.image, names, attributes, extra=extra)
+    file = exr.read(origin.path)
+    return exr.write(path, file, result.image, origin.taken["color"], attributes, extra=extra)
 
 
 def _check_distinct(sources: Sources) -> None:
@@ -125,7 +167,7 @@ def _same_file(a: Path, b: Path) -> bool:
     return a.exists() and b.exists() and os.path.samefile(a, b)
 
 
-def _denoised(sources: Sources, half_a: exr.Half, half_b: exr.Half) -> tuple[Any, Any] | None:
+def _denoised(sources: Sources, half_a: _Half, half_b: _Half) -> tuple[Any, Any] | None:
     """The denoised halves that the user named, else those that lie beside the halves."""
     size = half_a.buffers["color"].shape[:2]
     if sources.denoised_a and sources.denoised_b:
@@ -136,7 +178,7 @@ def _denoised(sources: Sources, half_a: exr.Half, half_b: exr.Half) -> tuple[Any
 
 
 def _color_of(path: str, size: tuple[int, ...]) -> Any:
-    color = exr.load_half(path).buffers["color"]
+    color = _half(path).buffers["color"]
     if color.shape[:2] != size:
         raise FrameError(
             f"{path}: expected {size[1]}x{size[0]} pixels like the halves, but got {color.shape[1]}x{color.shape[0]}"

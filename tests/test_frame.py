@@ -110,8 +110,8 @@ def test_denoise_hands_each_half_its_own_buffers() -> None:
     assert frame.denoised is None
     torch.testing.assert_close(denoised.denoised[1], frame.color[1] / 2)
     torch.testing.assert_close(denoised.denoised_full, (frame.color[0] + frame.color[1]) / 4)
-    assert torch.equal(calls[1][1], frame.albedo[1])
-    assert torch.equal(calls[2][1], (frame.albedo[0] + frame.albedo[1]) / 2)
+    assert torch.equal(calls[0][1], (frame.albedo[0] + frame.albedo[1]) / 2)
+    assert torch.equal(calls[2][1], frame.albedo[1])
     assert calls[0][2] is None
 
 
