@@ -14,6 +14,9 @@ from selfcorrect.errors import DenoiserError
 __all__ = ["Oidn"]
 
 
+_SCRATCH = 3 * 2**29  # bytes
+
+
 class Oidn:
     """OIDN's ``RT`` filter on the CPU, HDR on, at its default (high) quality.
 
@@ -30,8 +33,11 @@ class Oidn:
     reads_only = True
 
     def __init__(self, threads: int | None = None, scratch: int | None = None):
-        """``scratch`` bounds the filter's own memory, bytes; less than some 0.4 GB is not to be had."""
-        self.scratch = scratch
+        """``scratch`` bounds the filter's own memory, bytes: it goes through the image in tiles, with the same bits.
+
+        Less than some 0.34 GiB is not to be had. Left to itself it takes 1.1 GiB of 1920×1080, 2.9 GiB of 7680×4320.
+        """
+        self.scratch = scratch or _SCRATCH
         self.device = Device(DeviceType.CPU)
         if threads is not None:
             self.device.num_threads = threads
@@ -50,8 +56,7 @@ class Oidn:
         try:
             rt = self.device.new_filter("RT")
             rt.hdr = True
-            if self.scratch is not None:
-                rt.max_memory_mb = max(self.scratch >> 20, 1)  # it goes through the image in tiles: the same bits
+            rt.max_memory_mb = max(self.scratch >> 20, 1)
             for name, image in images.items():
                 rt.set_image(name, image)
             rt.execute()

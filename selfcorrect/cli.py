@@ -10,8 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NoReturn
 
-from selfcorrect import cli_sequence, exr, files, metrics
-from selfcorrect.cli_run import Runner, add_run_flags, answer, log, mapping
+from selfcorrect import cli_sequence, exr, files, memory, metrics
+from selfcorrect.cli_run import Runner, add_run_flags, answer, log, mapping, settings_of
 from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
@@ -52,6 +52,12 @@ def _parser() -> argparse.ArgumentParser:
     frame.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
     frame.add_argument("--denoised-b", metavar="DB.exr")
     frame.add_argument("--denoised", metavar="D.exr", help="denoised mean of both halves")
+    frame.add_argument(
+        "--maxmem",
+        metavar="SIZE",
+        help="most memory to take, such as 6G; a frame that does not fit is refused at once. OIDN works in what is "
+        "left, with the same result; other denoisers are not held to it",
+    )
     add_run_flags(frame)
     frame.set_defaults(run=_frame)
 
@@ -74,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="correct the packaged frame and show what was gained")
     demo.add_argument("-o", "--output", metavar="DIR", help="keep the images here")
     add_run_flags(demo)
-    demo.set_defaults(run=_demo)
+    demo.set_defaults(run=_demo, maxmem=None)
     return parser
 
 
@@ -92,7 +98,10 @@ def _run(
 ) -> dict[str, Any]:
     """Correct one frame from files to file; returns what --json prints. ``show`` is called with the denoised frame."""
     start = time.perf_counter()
-    runner = Runner(options, given=sources.denoised_a is not None)
+    scratch = None
+    if options.maxmem is not None:
+        scratch = memory.scratch_within(memory.parse_size(options.maxmem), sources, settings_of(options))
+    runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
     remove_abandoned(exr.check_target(output).parent)
     corrected = runner.correct(files.load(sources), began=start, show=show)
     return runner.write(output, corrected, {})

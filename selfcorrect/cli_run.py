@@ -22,7 +22,7 @@ from selfcorrect.independence import doubts
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 
-__all__ = ["Corrected", "Runner", "add_run_flags", "answer", "log", "mapping"]
+__all__ = ["Corrected", "Runner", "add_run_flags", "answer", "log", "mapping", "settings_of"]
 
 
 def log(line: str) -> None:
@@ -59,7 +59,8 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         )
 
 
-def _settings(options: argparse.Namespace) -> Settings:
+def settings_of(options: argparse.Namespace) -> Settings:
+    """The preset, with what the flags change."""
     changes = {f.name: getattr(options, f.name) for f in fields(Settings)}
     return Settings.preset(options.preset, **{k: v for k, v in changes.items() if v is not None})
 
@@ -114,13 +115,14 @@ class Runner:
     Args:
         options: what the flags of :func:`add_run_flags` gave.
         given: denoised halves are given, so that no denoiser is needed.
+        scratch: bytes that the denoiser may take beside its images, where it can be told.
 
     Raises:
         SelfcorrectError: settings, device or denoiser are not to be had.
     """
 
-    def __init__(self, options: argparse.Namespace, *, given: bool):
-        self.settings = _settings(options)
+    def __init__(self, options: argparse.Namespace, *, given: bool, scratch: int | None = None):
+        self.settings = settings_of(options)
         if options.aov and not self.settings.guard:
             aov = ",".join(options.aov)
             raise SettingsError(f"expected the guard with --aov {aov}, but got settings that turn it off")
@@ -129,7 +131,8 @@ class Runner:
         self._taken: dict[str, list[str]] = {}
         self._denoise = None
         if options.denoiser is not None or not given:
-            self._denoise = denoisers.create(options.denoiser or denoisers.default(), threads=options.threads)
+            spec = options.denoiser or denoisers.default()
+            self._denoise = denoisers.create(spec, threads=options.threads, scratch=scratch)
 
     @property
     def denoiser(self) -> str:

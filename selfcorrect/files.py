@@ -115,7 +115,8 @@ class _Half(NamedTuple):
 
 def _half(path: str, mapping: Mapping[str, str] | None = None) -> _Half:
     half = exr.load_half(path, mapping=mapping)
-    return _Half({role: torch.from_numpy(buffer) for role, buffer in half.buffers.items()}, half.taken)
+    used = {role: torch.from_numpy(buffer) for role, buffer in half.buffers.items() if role != "alpha"}
+    return _Half(used, half.taken)
 
 
 def _stamp(path: str) -> tuple[int, int, int]:
