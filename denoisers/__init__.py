@@ -37,13 +37,14 @@ def default() -> str:
     return "joint-bilateral" if importlib.util.find_spec("mitsuba_oidn") is None else "oidn"
 
 
-def create(spec: str, *, threads: int | None = None) -> Denoise:
+def create(spec: str, *, threads: int | None = None, scratch: int | None = None) -> Denoise:
     """Create a denoiser from its specification.
 
     Args:
         spec: one of the forms that :func:`names` returns.
         threads: CPU threads of ``oidn``, ``onnx``, ``joint-bilateral``, ``nlm`` and ``nfor``, at least 1; None
             leaves the number to them. A command and a user's class see to their own threads.
+        scratch: bytes that ``oidn`` may take beside its images; the others see to their own memory.
 
     Raises:
         DenoiserError: the specification is unknown, or the model, the command or the class does not fit.
@@ -53,14 +54,14 @@ def create(spec: str, *, threads: int | None = None) -> Denoise:
     """
     if threads is not None and threads < 1:
         raise SettingsError(f"threads: expected at least 1, but got {threads}")
-    return Denoise(_plugin(spec, threads))
+    return Denoise(_plugin(spec, threads, scratch))
 
 
-def _plugin(spec: str, threads: int | None) -> Plugin | DualPlugin:
+def _plugin(spec: str, threads: int | None, scratch: int | None) -> Plugin | DualPlugin:
     plugin: Plugin | DualPlugin
     match spec.split(":", maxsplit=1):
         case ["oidn"]:
-            plugin = _adapter("oidn", extra="oidn").Oidn(threads)
+            plugin = _adapter("oidn", extra="oidn").Oidn(threads, scratch)
         case ["joint-bilateral"]:
             plugin = _adapter("joint_bilateral").JointBilateral(threads)
         case ["box"]:

@@ -25,6 +25,8 @@ class Plugin(Protocol):
         name: what messages call it.
         multiple: height and width are padded to a multiple of this number of pixels.
         features: those of ``"albedo"`` and ``"normal"`` that it uses; it gets no others.
+        reads_only: it leaves its arguments alone, and takes float16 as well as float32: it is spared a copy of them,
+            which of a large frame is a gigabyte. By default False.
     """
 
     name: str
@@ -34,9 +36,9 @@ class Plugin(Protocol):
     def denoise(self, color: torch.Tensor, albedo: torch.Tensor | None, normal: torch.Tensor | None) -> torch.Tensor:
         """Return the denoised colour, linear and unclamped.
 
-        Each argument is a contiguous float32 CPU tensor of shape (H, W, 3) that the plug-in may overwrite,
-        finite throughout: colour is linear radiance, albedo and normal are as the renderer wrote them, or
-        None where the frame has none. The result has the shape of colour and is finite.
+        Each argument is a contiguous float32 CPU tensor of shape (H, W, 3) that the plug-in may overwrite (see
+        ``reads_only``), finite throughout: colour is linear radiance, albedo and normal are as the renderer
+        wrote them, or None where the frame has none. The result has the shape of colour and is finite.
         """
         ...
 
@@ -74,6 +76,7 @@ class Denoise:
         self.multiple = getattr(plugin, "multiple", 1)
         self.features = plugin.features
         self.dual: bool = getattr(plugin, "dual", False)
+        self._shares = getattr(plugin, "reads_only", False)
 
     def __call__(self, color: Image, albedo: Array | None = None, normal: Array | None = None) -> Image:
         """Denoise one image.
@@ -98,7 +101,7 @@ class Denoise:
             if feature is not None:
                 _checked_size(name, feature, size)
         pad = {"bottom": -size[0] % self.multiple, "right": -size[1] % self.multiple}
-        padded: torch.Tensor = mirrored(_float32("color", color), **pad)
+        padded: torch.Tensor = mirrored(self._checked("color", color), **pad)
         with torch.no_grad():
             result = cast(Plugin, self.plugin).denoise(
                 padded, self._feature("albedo", albedo, pad), self._feature("normal", normal, pad)
@@ -126,10 +129,10 @@ class Denoise:
                 continue
             for feature in pair:
                 _checked_size(name, feature, (height, width), channels=1 if name in ("depth", "visibility") else 3)
-            given[name] = (_float32(name, pair[0]), _float32(name, pair[1]))
+            given[name] = (_finite(name, _float32(pair[0])), _finite(name, _float32(pair[1])))
         with torch.no_grad():
             results = cast(DualPlugin, self.plugin).denoise_pair(
-                (_float32("color", color[0]), _float32("color", color[1])), given
+                (_finite("color", _float32(color[0])), _finite("color", _float32(color[1]))), given
             )
         for result in results:
             self._check_result(result, (height, width, 3))
@@ -141,7 +144,15 @@ class Denoise:
     def _feature(self, name: str, value: Array | None, pad: dict[str, int]) -> torch.Tensor | None:
         if value is None or name not in self.features:
             return None
-        return mirrored(_float32(name, value), **pad)
+        return mirrored(self._checked(name, value, half=True), **pad)
+
+    def _checked(self, name: str, value: Array, *, half: bool = False) -> torch.Tensor:
+        """An image as the plug-in takes it; the caller's own memory only where the plug-in leaves that alone."""
+        shared = self._shares and isinstance(value, torch.Tensor) and value.device.type == "cpu"
+        kinds = (torch.float32, torch.float16) if half else (torch.float32,)
+        if not (shared and isinstance(value, torch.Tensor) and value.dtype in kinds):
+            return _finite(name, _float32(value))
+        return _finite(name, value.detach().contiguous())
 
     def _check_result(self, result: object, shape: tuple[int, ...]) -> None:
         """Refuse by name what a plug-in must not return."""
@@ -174,13 +185,15 @@ def _checked_size(name: str, value: object, expected: tuple[int, int] | None, ch
     return shape[0], shape[1]
 
 
-def _float32(name: str, value: Array) -> torch.Tensor:
-    """Copy an image to a contiguous float32 CPU tensor: the plug-in never sees the caller's memory."""
+def _float32(value: Array) -> torch.Tensor:
+    """Copy an image to a contiguous float32 CPU tensor."""
     if isinstance(value, torch.Tensor):
-        tensor = value.detach().to("cpu", torch.float32, copy=True, memory_format=torch.contiguous_format)
-    else:
-        with np.errstate(over="ignore"):  # what float32 cannot hold is reported below
-            tensor = torch.from_numpy(np.array(value, dtype=np.float32, order="C"))
+        return value.detach().to("cpu", torch.float32, copy=True, memory_format=torch.contiguous_format)
+    with np.errstate(over="ignore"):  # what float32 cannot hold is reported by who calls
+        return torch.from_numpy(np.array(value, dtype=np.float32, order="C"))
+
+
+def _finite(name: str, tensor: torch.Tensor) -> torch.Tensor:
     bad = int((~torch.isfinite(tensor)).sum())
     if bad:
         raise FrameError(f"{name}: expected finite values, but got {bad} that are not in float32; repair them first")

@@ -5,13 +5,13 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NoReturn
 
-from selfcorrect import cli_bench, cli_sequence, exr, files, metrics
-from selfcorrect.cli_run import EndOnInterrupt, Runner, add_run_flags, answer, log, mapping
+from selfcorrect import cli_bench, cli_sequence, exr, files, memory, metrics
+from selfcorrect.cli_run import EndOnInterrupt, Runner, add_run_flags, answer, log, mapping, settings_of
 from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
@@ -53,6 +53,12 @@ def _parser() -> argparse.ArgumentParser:
     frame.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
     frame.add_argument("--denoised-b", metavar="DB.exr")
     frame.add_argument("--denoised", metavar="D.exr", help="denoised mean of both halves")
+    frame.add_argument(
+        "--maxmem",
+        metavar="SIZE",
+        help="most memory to take, such as 6G; a frame that does not fit is refused at once. OIDN works in what is "
+        "left, with the same result; other denoisers are not held to it",
+    )
     add_run_flags(frame)
     frame.set_defaults(run=_frame)
 
@@ -88,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="correct the packaged frame and show what was gained")
     demo.add_argument("-o", "--output", metavar="DIR", help="keep the images here")
     add_run_flags(demo)
-    demo.set_defaults(run=_demo)
+    demo.set_defaults(run=_demo, maxmem=None)
     return parser
 
 
@@ -96,20 +102,24 @@ def _frame(options: argparse.Namespace) -> None:
     sources = files.Sources(
         options.a, options.b, options.denoised_a, options.denoised_b, options.denoised, mapping(options)
     )
-    report, _ = _run(options, sources, options.output)
+    report = _run(options, sources, options.output)
     if options.json:
         answer(report)
 
 
-def _run(options: argparse.Namespace, sources: files.Sources, output: str) -> tuple[dict[str, Any], Frame]:
-    """Correct one frame from files to file; returns what --json prints, and the frame."""
+def _run(
+    options: argparse.Namespace, sources: files.Sources, output: str, show: Callable[[Frame], None] | None = None
+) -> dict[str, Any]:
+    """Correct one frame from files to file; returns what --json prints. ``show`` is called with the denoised frame."""
     start = time.perf_counter()
-    runner = Runner(options, given=sources.denoised_a is not None)
+    scratch = None
+    if options.maxmem is not None:
+        scratch = memory.scratch_within(memory.parse_size(options.maxmem), sources, settings_of(options))
+    runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
     remove_abandoned(exr.check_target(output).parent)
-    loaded = files.load(sources)
     with EndOnInterrupt() as stop:
-        corrected = runner.correct(loaded, began=start, stop=stop)
-        return runner.write(output, loaded, corrected, {}), corrected.frame
+        corrected = runner.correct(files.load(sources), began=start, show=show, stop=stop)
+        return runner.write(output, corrected, {})
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -169,7 +179,9 @@ def _demo(options: argparse.Namespace) -> None:
             name: str(data / f"demo_{name}.exr") for name in ("064spp_A", "064spp_B", "ref_A", "ref_B", "ref_smooth")
         }
         sources = files.Sources(names["064spp_A"], names["064spp_B"], mapping=mapping(options))
-        report, frame = _run(options, sources, str(folder / "corrected.exr"))
+        frames: list[Frame] = []
+        report = _run(options, sources, str(folder / "corrected.exr"), frames.append)
+        frame = frames[0]
         color = [exr.load_half(names[n]).buffers["color"] for n in ("ref_A", "ref_B", "ref_smooth")]
         images = {
             "noisy": (frame.color[0] + frame.color[1]) / 2,

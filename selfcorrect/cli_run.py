@@ -24,7 +24,7 @@ from selfcorrect.independence import doubts
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 
-__all__ = ["Corrected", "EndOnInterrupt", "Runner", "add_run_flags", "answer", "log", "mapping"]
+__all__ = ["Corrected", "EndOnInterrupt", "Runner", "add_run_flags", "answer", "log", "mapping", "settings_of"]
 
 _WRITE_SECONDS = 5e-7  # a pixel
 
@@ -75,7 +75,8 @@ def _seconds(text: str) -> float:
         raise SettingsError(f"expected a time like 10s or 2m, but got {text!r}") from None
 
 
-def _settings(options: argparse.Namespace) -> Settings:
+def settings_of(options: argparse.Namespace) -> Settings:
+    """The preset, with what the flags change."""
     changes = {f.name: getattr(options, f.name) for f in fields(Settings)}
     return Settings.preset(options.preset, **{k: v for k, v in changes.items() if v is not None})
 
@@ -105,17 +106,19 @@ def _use_machine(options: argparse.Namespace) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """A frame in memory, corrected.
+    """What is left of a frame that was corrected: not its buffers.
 
     Attributes:
-        frame: it, with its denoised halves.
+        origin: its half a.
+        facts: what --json tells of it.
         result: the correction.
         denoiser: who denoised it.
         began: when the work on it began, by ``time.perf_counter``.
         seconds: how long the stages before the correction took.
     """
 
-    frame: Frame
+    origin: files.Origin
+    facts: dict[str, Any]
     result: Result
     denoiser: str
     began: float
@@ -128,13 +131,14 @@ class Runner:
     Args:
         options: what the flags of :func:`add_run_flags` gave.
         given: denoised halves are given, so that no denoiser is needed.
+        scratch: bytes that the denoiser may take beside its images, where it can be told.
 
     Raises:
         SelfcorrectError: settings, device or denoiser are not to be had.
     """
 
-    def __init__(self, options: argparse.Namespace, *, given: bool):
-        self.settings = _settings(options)
+    def __init__(self, options: argparse.Namespace, *, given: bool, scratch: int | None = None):
+        self.settings = settings_of(options)
         if options.aov and not self.settings.guard:
             aov = ",".join(options.aov)
             raise SettingsError(f"expected the guard with --aov {aov}, but got settings that turn it off")
@@ -143,7 +147,8 @@ class Runner:
         self._taken: dict[str, list[str]] = {}
         self._denoise = None
         if options.denoiser is not None or not given:
-            self._denoise = denoisers.create(options.denoiser or denoisers.default(), threads=options.threads)
+            spec = options.denoiser or denoisers.default()
+            self._denoise = denoisers.create(spec, threads=options.threads, scratch=scratch)
 
     @property
     def denoiser(self) -> str:
@@ -158,12 +163,24 @@ class Runner:
         *,
         began: float | None = None,
         stop: Callable[[], bool] | None = None,
+        show: Callable[[Frame], None] | None = None,
     ) -> Corrected:
-        """Denoise and correct a frame; ``meanwhile`` is called after every step, ``stop`` says when to end training."""
+        """Denoise and correct a frame.
+
+        Args:
+            loaded: it, as read; its frame is given up.
+            network: to start from.
+            meanwhile: called after every optimiser step.
+            began: when the work on it began.
+            stop: says when to end training.
+            show: called with the denoised frame.
+        """
         start = time.perf_counter()
         began = start if began is None else began
         seconds = {"read": start - began}
         frame, denoiser = self.prepare(loaded, seconds)
+        if show is not None:
+            show(frame)
         with _Progress(meanwhile) as progress:
             result = correct(
                 frame.to(self._options.device),
@@ -172,7 +189,7 @@ class Runner:
                 progress=progress,
                 stop=stop,
             )
-        return Corrected(frame, result, denoiser, began, seconds)
+        return Corrected(loaded.origin, _facts(frame, result), result, denoiser, began, seconds)
 
     def prepare(self, loaded: files.Loaded, seconds: dict[str, float]) -> tuple[Frame, str]:
         """Denoise a frame where that is to be done, and tell of it; ``seconds`` is added to.
@@ -180,10 +197,11 @@ class Runner:
         Returns:
             The frame with its denoised halves, and who denoised it.
         """
-        if loaded.taken != self._taken:  # of a shot, only where it changes
-            for role, names in loaded.taken.items():
+        taken = loaded.origin.taken
+        if taken != self._taken:  # of a shot, only where it changes
+            for role, names in taken.items():
                 log(f"{role}: {', '.join(names)}")
-        self._taken = loaded.taken
+        self._taken = taken
         for doubt in doubts(loaded.frame):
             log(f"warning: {doubt}")
         frame, denoiser = _denoised(self._options, loaded.frame, self._denoise, seconds)
@@ -200,7 +218,7 @@ class Runner:
         # a budget that is spent already must not turn into none
         return replace(self.settings, time_budget=max(self.settings.time_budget - spent - writing, 1e-9))
 
-    def write(self, output: str, loaded: files.Loaded, corrected: Corrected, more: Mapping[str, Any]) -> dict[str, Any]:
+    def write(self, output: str, corrected: Corrected, more: Mapping[str, Any]) -> dict[str, Any]:
         """Write a frame; returns what --json prints. ``more`` is kept in the output's attribute, too."""
         written = time.perf_counter()
         result = corrected.result
@@ -214,7 +232,7 @@ class Runner:
             **more,
         }
         extra = _extra(self._options, result)
-        clipped = files.save(output, loaded, result, settings=self.settings, details=details, extra=extra)
+        clipped = files.save(output, corrected.origin, result, settings=self.settings, details=details, extra=extra)
         lines = [] if result.estimate is None else [str(result.estimate)]
         if clipped:
             lines.append(f"{output}: {clipped} values beyond the range of half floats were clipped")
@@ -226,9 +244,9 @@ class Runner:
             "output": output,
             "settings": self.settings.to_dict(),
             **details,
-            "channels": loaded.taken,
+            "channels": corrected.origin.taken,
             "seconds": {name: round(value, 3) for name, value in seconds.items()},
-            **_facts(corrected.frame, result),
+            **corrected.facts,
         }
 
 

@@ -1,6 +1,7 @@
 """The command `sequence`: the frames of a shot, from files to files."""
 
 import argparse
+from functools import partial
 from typing import Any
 
 from selfcorrect import shot
@@ -64,7 +65,7 @@ def _sequence(options: argparse.Namespace) -> int:
         corrected = runner.correct(job.loaded, network, job.meanwhile)
         log(f"frame {job.frame}: {_started(corrected.result.start)}")
         more = {"frame": job.frame, "recipe": job.recipe}
-        return shot.Done(corrected.result.network, lambda: runner.write(job.output, job.loaded, corrected, more))
+        return shot.Done(corrected.result.network, partial(runner.write, job.output, corrected, more))
 
     def report(outcome: shot.Outcome) -> None:
         if outcome.kind != "written":

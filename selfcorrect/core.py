@@ -11,9 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from selfcorrect.bands import Scaled, bands, scaled
 from selfcorrect.frame import Half, mean
 from selfcorrect.guard import trust_in_full
-from selfcorrect.infer import infer, infer_tile
+from selfcorrect.infer import TILE, infer, infer_tile
 from selfcorrect.kernel import Guides
 from selfcorrect.network import Network
 from selfcorrect.patches import crops, overhang
@@ -22,6 +23,8 @@ from selfcorrect.stages.steps import State
 from selfcorrect.train import Limits, Progress, starting_losses, train
 
 __all__ = ["Start", "Trained", "inferred", "trained"]
+
+Keep = Callable[[slice, tuple[Tensor, Tensor]], None]
 
 _TRIAL = 256  # side of the tile whose time is taken for the time budget
 _GUARD_SECONDS = 2e-6  # a pixel, with some to spare
@@ -76,21 +79,28 @@ def trained(
     return Trained(network, start, losses)
 
 
-def inferred(state: State, network: Network, settings: Settings) -> State:
-    """What a network makes of each half with its own image, and of both with the full one where that helps."""
+def inferred(state: State, network: Network, settings: Settings, keep: Keep) -> Tensor:
+    """The corrected image, of each half with its own denoised image, and of both with the full one where that helps.
 
-    def corrected(shown: Tensor | None) -> tuple[Tensor, Tensor]:
-        a, b = (
-            infer(network, half, settings, scale=state.scale, denoised=shown).div_(state.scale) for half in state.halves
-        )
+    ``keep`` is called with rows and what the network makes there of each half with its own image, of radiance times
+    the state's scale: whole corrected halves are not held here.
+    """
+    images = Scaled(state.images[0], state.scale), Scaled(state.images[1], state.scale)
+    full = Scaled(state.full, state.scale)
+    image = torch.empty_like(state.full)
+
+    def corrected(rows: slice, shown: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        a, b = (infer(network, half, settings, scale=state.scale, denoised=shown, rows=rows) for half in state.halves)
         return a, b
 
-    with_halves = corrected(None)
-    image = mean(with_halves)
-    if settings.inference == "full":
-        trust = trust_in_full(state.images, state.full, scale=state.scale).to(image.dtype)
-        image += trust * (mean(corrected(state.full)) - image)
-    return state.then(with_halves, image.clamp(min=0))
+    for rows in bands(image.shape[0], TILE):
+        halves = corrected(rows)
+        image[rows] = mean(halves)
+        if settings.inference == "full":
+            trust = trust_in_full(images, full, rows).to(image.dtype)
+            image[rows] += trust * (mean(corrected(rows, state.full)) - image[rows])
+        keep(rows, halves)
+    return scaled(image.clamp_(min=0), 1 / state.scale)
 
 
 def _training_guides(state: State, settings: Settings, generator: torch.Generator) -> tuple[Guides, Guides]:

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from selfcorrect.bands import Scaled, average, scaled, tile_means
 from selfcorrect.core import Start, inferred, trained
 from selfcorrect.errors import FrameError
 from selfcorrect.frame import Frame, mean
-from selfcorrect.guard import Estimate, Guarded, guard, keep_light
+from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 from selfcorrect.stages import steps
@@ -86,21 +87,25 @@ def correct(
     def timed(name: str, begun: float) -> None:
         seconds[name] = time.perf_counter() - begun
 
-    for name in settings.stage_names:
+    evidence = Evidence(first.scaled_color, first.scaled_images) if settings.guard else None
+    for position, name in enumerate(settings.stage_names, 1):
         begun = time.perf_counter()
         if name == "core":
             core = trained(state, settings, warm_start=warm_start, progress=progress, stop=stop)
             timed("train", begun)
             begun = time.perf_counter()
-            state = inferred(state, core.network, settings)
+            last = position == len(settings.stage_names)
+            state = _inferred(state, core.network, settings, evidence if last else None)
             timed("infer", begun)
         else:
             state = _STEPS[name](state, settings)
             timed(name, begun)
     image, guarded = state.full.clamp(min=0), None
-    if settings.guard:
+    if evidence is not None:
         begun = time.perf_counter()
-        image, guarded = _guarded(first, state)
+        if not evidence.complete:
+            evidence.add(slice(0, frame.size[0]), (state.scaled_images[0][:], state.scaled_images[1][:]))
+        image, guarded = _guarded(first, image, evidence)
         timed("guard", begun)
     return Result(
         image=frame.like_input(image),
@@ -108,28 +113,43 @@ def correct(
         losses=core.losses if core else [],
         seconds=seconds,
         estimate=guarded.estimate if guarded else None,
-        aovs=_aovs(guarded) if guarded else {},
+        aovs=dict(zip(("blend", "error.before", "error.after"), guarded.maps(), strict=True)) if guarded else {},
         input_scale=first.scale,
         start=core.start if core else Start(warm=False),
     )
 
 
-def _aovs(guarded: Guarded) -> dict[str, Tensor]:
-    return {"blend": guarded.alpha, "error.before": guarded.errors[0], "error.after": guarded.errors[1]}
-
-
 def _automatic_scale(frame: Frame) -> float:
     """What brings the denoised frame's mean near 1; by the mean of roots, which a few bright pixels do not move."""
-    assert frame.denoised is not None
-    roots = torch.stack(frame.denoised).double().mean(-1).clamp(min=0).sqrt().mean()
-    return float(1 / roots**2) if roots > 0 else 1.0
+    denoised = frame.denoised
+    assert denoised is not None  # correct() has checked; tells the type checker
+
+    def roots(rows: slice) -> Tensor:
+        return torch.stack([half[rows].double().mean(-1).clamp(min=0).sqrt() for half in denoised])
+
+    root = sum(average(tile_means(frame.size[0], roots), frame.size)) / 2
+    return 1 / root**2 if root > 0 else 1.0
 
 
-def _guarded(first: State, last: State) -> tuple[Tensor, Guarded]:
-    """What the stages made of the frame, guarded against what the denoiser had."""
-    before, after = first.scaled(), last.scaled()
-    guarded = guard(before.color, before.images, after.images, before.full, after.full, scale=first.scale)
+def _inferred(state: State, network: Network, settings: Settings, evidence: Evidence | None) -> State:
+    """The state after the core; where nothing but the guard comes after it, the halves go to its evidence alone."""
+    if evidence is not None:
+        return state._replace(full=inferred(state, network, settings, evidence.add))
+    images = torch.empty_like(state.full), torch.empty_like(state.full)
+
+    def keep(rows: slice, halves: tuple[Tensor, Tensor]) -> None:
+        for image, half in zip(images, halves, strict=True):
+            image[rows] = half / state.scale
+
+    full = inferred(state, network, settings, keep)
+    return state.then(images, full)
+
+
+def _guarded(first: State, image: Tensor, evidence: Evidence) -> tuple[Tensor, Guarded]:
+    """What the stages made of the frame, guarded against what the denoiser had; ``image`` is used up."""
+    full = Scaled(first.full, first.scale)
+    guarded = guard(evidence, full, scaled(image, first.scale), scale=first.scale)
     if not guarded.estimate.improved:
         return first.full, guarded
-    kept = keep_light(guarded.image, before.full, before.color)
-    return (kept.double() / first.scale).clamp(0, torch.finfo(torch.float32).max).float(), guarded
+    kept = keep_light(guarded.image, full, first.scaled_color)
+    return scaled(kept, 1 / first.scale).clamp_(min=0), guarded

@@ -32,6 +32,7 @@ from selfcorrect.publish import publish
 
 __all__ = ["ExrFile", "Half", "Inspection", "check_target", "inspect", "load_half", "read", "write"]
 
+_FEATURES = {"albedo", "normal", "visibility", "depth"}
 _HALF_MAX = 65504.0
 _LOSSY = {"B44_COMPRESSION", "B44A_COMPRESSION", "DWAA_COMPRESSION", "DWAB_COMPRESSION"}
 _REWRITTEN = {"channels", "chunkCount", "compression"}
@@ -43,14 +44,14 @@ class Half:
 
     Attributes:
         file: the file that holds the colour.
-        buffers: role → (height, width, channels) array, float32, C-contiguous; values as they are in the
-            file. Roles are those of :data:`selfcorrect.channels.ROLES`, and ``denoised`` where a separate
-            file has it.
+        buffers: role → (height, width, channels) array, C-contiguous; values as they are in the file: float32,
+            but float16 for G-buffers that the file has as half floats. Roles are those of
+            :data:`selfcorrect.channels.ROLES`, and ``denoised`` where a separate file has it.
         taken: role → the channels that were taken, ``file:channel`` where another file gave them.
     """
 
     file: ExrFile
-    buffers: dict[str, NDArray[np.float32]]
+    buffers: dict[str, NDArray[np.floating[Any]]]
     taken: dict[str, list[str]]
 
 
@@ -83,12 +84,20 @@ def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None) -> 
                     f"{source.path}: expected channel '{name}' ({role}) with the colour's data window "
                     f"{tuple(window)}, but got {tuple(_window(source, name))}"
                 )
-        buffers[role] = np.stack([source.pixels(name) for name in names], axis=-1).astype(np.float32)
+        buffers[role] = _stacked([source.pixels(name) for name in names], half=role in _FEATURES)
         prefix = "" if source is file else f"{Path(source.path).name}:"
         taken[role] = [prefix + name for name in names]
     for name in chosen["color"]:
         _float_type(file, name)
     return Half(file, buffers, taken)
+
+
+def _stacked(planes: Sequence[Pixels], *, half: bool) -> NDArray[np.floating[Any]]:
+    kept = half and all(plane.dtype == np.float16 for plane in planes)
+    image = np.empty((*planes[0].shape, len(planes)), np.float16 if kept else np.float32)
+    for index, plane in enumerate(planes):
+        image[..., index] = plane
+    return image
 
 
 def _window(file: ExrFile, name: str) -> Window:
@@ -162,7 +171,7 @@ def _same_size(source: ExrFile, name: str, values: Pixels, replaced: Pixels) -> 
 
 def _encode(
     source: ExrFile, contents: Sequence[Mapping[str, Pixels]], added: Mapping[str, str], file: str
-) -> bytearray:
+) -> memoryview:
     parts, kept = [], []
     for index, (part, arrays) in enumerate(zip(source.parts, contents, strict=True)):
         new = added if index == 0 else {}
@@ -182,7 +191,7 @@ def _encode(
             OpenEXR.File(parts).write(stream)
     except LIBRARY_ERRORS as error:
         raise FileError(f"{file}: expected a writable image, but got: {one_line(error)}") from None
-    data = bytearray(stream.getbuffer())
+    data = stream.getbuffer()
     exrheader.restore(data, kept, file)
     return data
 

@@ -7,6 +7,7 @@ prints a warning and leaves the part out.
 
 import contextlib
 import io
+import mmap
 import os
 import threading
 from collections.abc import Iterator, Mapping
@@ -22,7 +23,7 @@ from selfcorrect import channels, exrheader
 from selfcorrect.errors import ChannelError, FileError
 from selfcorrect.exrheader import Attribute, Window
 
-__all__ = ["LIBRARY_ERRORS", "OUTPUT", "ExrFile", "Part", "Pixels", "one_line", "quiet", "read"]
+__all__ = ["LIBRARY_ERRORS", "OUTPUT", "ExrFile", "Part", "Pixels", "headers", "one_line", "quiet", "read"]
 
 Pixels = NDArray[Any]
 
@@ -116,6 +117,25 @@ class ExrFile:
         return self.parts[index].channels[channel]
 
 
+def headers(file: str) -> tuple[list[exrheader.Header], int]:
+    """The headers of all parts of a file, and its size in bytes; no pixel is read.
+
+    Raises:
+        FileError: the file is missing or no OpenEXR file, or its header is not complete.
+    """
+    try:
+        with open(file, "rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if not size:
+                return exrheader.parse(b"", file)[0], 0
+            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as whole, memoryview(whole) as data:
+                return exrheader.parse(data, file)[0], size
+    except IsADirectoryError:
+        raise FileError(f"{file}: expected an OpenEXR file, but got a folder") from None
+    except OSError as error:
+        raise FileError(f"{file}: expected an OpenEXR file, but got: {error.strerror}") from None
+
+
 def read(path: str | Path) -> ExrFile:
     """Read a file with all its pixels.
 
@@ -155,7 +175,10 @@ def _bytes(file: str) -> bytes:
     """The whole file, or its first bytes where they show that it is something else, however large."""
     with open(file, "rb") as stream:
         start = stream.read(len(exrheader.MAGIC))
-        return start + stream.read() if start == exrheader.MAGIC else start
+        if start != exrheader.MAGIC:
+            return start
+        stream.seek(0)
+        return stream.read()
 
 
 def _part(part: Any, header: exrheader.Header) -> Part:

@@ -102,7 +102,7 @@ class Header:
     compression: int
 
 
-def parse(data: bytes, file: str) -> tuple[list[Header], int]:
+def parse(data: bytes | memoryview, file: str) -> tuple[list[Header], int]:
     """Read the headers of all parts.
 
     Args:
@@ -116,7 +116,7 @@ def parse(data: bytes, file: str) -> tuple[list[Header], int]:
         FileError: the file is no OpenEXR file, or its header is not complete.
     """
     if data[:4] != MAGIC:
-        got = "an empty file" if not data else f"a file that begins with {data[:4]!r}"
+        got = "an empty file" if not data else f"a file that begins with {bytes(data[:4])!r}"
         raise FileError(f"{file}: expected an OpenEXR file, but got {got}")
     try:
         (version,) = struct.unpack_from("<I", data, 4)
@@ -133,7 +133,7 @@ def parse(data: bytes, file: str) -> tuple[list[Header], int]:
     return headers, position + bool(version & _MULTIPART)
 
 
-def _attributes(data: bytes, position: int) -> tuple[dict[str, Attribute], int]:
+def _attributes(data: bytes | memoryview, position: int) -> tuple[dict[str, Attribute], int]:
     attributes = {}
     while data[position]:
         name, position = _word(data, position)
@@ -142,14 +142,15 @@ def _attributes(data: bytes, position: int) -> tuple[dict[str, Attribute], int]:
         position += 4
         if not 0 <= size <= len(data) - position:
             raise ValueError("an attribute that ends outside the file")
-        attributes[name] = Attribute(kind, data[position : position + size], position)
+        attributes[name] = Attribute(kind, bytes(data[position : position + size]), position)
         position += size
     return attributes, position + 1
 
 
-def _word(data: bytes, position: int) -> tuple[str, int]:
-    end = data.index(b"\0", position, position + 256)
-    return data[position:end].decode("utf-8", "surrogateescape"), end + 1
+def _word(data: bytes | memoryview, position: int) -> tuple[str, int]:
+    word = bytes(data[position : position + 256])
+    word = word[: word.index(b"\0")]
+    return word.decode("utf-8", "surrogateescape"), position + len(word) + 1
 
 
 def _header(attributes: dict[str, Attribute], version: int) -> Header:
@@ -276,7 +277,7 @@ def _is_text(data: bytes) -> bool:
     return True
 
 
-def restore(data: bytearray, sources: Sequence[Mapping[str, Attribute]], file: str) -> None:
+def restore(data: memoryview, sources: Sequence[Mapping[str, Attribute]], file: str) -> None:
     """Put the bytes that attributes had back into a file just written, in place.
 
     Args:
@@ -284,7 +285,7 @@ def restore(data: bytearray, sources: Sequence[Mapping[str, Attribute]], file: s
         sources: per part, name → attribute as it was; those that are of another length now stay as they are.
         file: what messages call the file.
     """
-    headers, _ = parse(bytes(data), file)
+    headers, _ = parse(data, file)
     for header, attributes in zip(headers, sources, strict=True):
         for name, attribute in attributes.items():
             now = header.attributes.get(name)

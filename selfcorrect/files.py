@@ -5,8 +5,9 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from selfcorrect import exr
@@ -15,7 +16,7 @@ from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsErro
 from selfcorrect.frame import Frame, repaired
 from selfcorrect.settings import Settings
 
-__all__ = ["Images", "Loaded", "Sources", "load", "load_images", "save", "save_combined"]
+__all__ = ["Images", "Loaded", "Origin", "Sources", "load", "load_images", "save", "save_combined"]
 
 _FEATURES = ("albedo", "normal", "visibility", "depth")
 
@@ -41,19 +42,32 @@ class Sources:
     mapping: Mapping[str, str] | None = None
 
 
+@dataclass(frozen=True)
+class Origin:
+    """The file of half a, whose pixels are not kept: what passes through is read again when it is written.
+
+    Attributes:
+        path: the file, with its layer.
+        taken: role → channel names.
+        stamp: what tells whether it has changed since.
+    """
+
+    path: str
+    taken: dict[str, list[str]]
+    stamp: tuple[int, int, int]
+
+
 @dataclass(frozen=True, eq=False)
 class Loaded:
     """A frame in memory, and where it came from.
 
     Attributes:
         frame: its buffers; without denoised halves where the files hold none.
-        source: half a as it was read.
-        taken: role → channel names of half a.
+        origin: half a.
     """
 
     frame: Frame
-    source: exr.Half
-    taken: dict[str, list[str]]
+    origin: Origin
 
 
 def load(sources: Sources) -> Loaded:
@@ -65,18 +79,17 @@ def load(sources: Sources) -> Loaded:
         FrameError: sizes do not fit.
     """
     _check_distinct(sources)
-    half_a = exr.load_half(sources.a, mapping=sources.mapping)
-    half_b = exr.load_half(sources.b, mapping=sources.mapping)
+    stamp = _stamp(sources.a)
+    half_a, half_b = (_half(path, sources.mapping) for path in (sources.a, sources.b))
     height, width = half_a.buffers["color"].shape[:2]
     if half_b.buffers["color"].shape[:2] != (height, width):
         other = half_b.buffers["color"].shape
         raise FrameError(
             f"{sources.b}: expected {width}x{height} pixels like {sources.a}, but got {other[1]}x{other[0]}"
         )
-    windows = [half.file.parts[half.file.place(half.taken["color"][0])[0]].data_window for half in (half_a, half_b)]
-    if windows[0] != windows[1]:
+    if half_a.window != half_b.window:
         raise FrameError(
-            f"{sources.b}: expected the data window {tuple(windows[0])} of {sources.a}, but got {tuple(windows[1])}; "
+            f"{sources.b}: expected the data window {half_a.window} of {sources.a}, but got {half_b.window}; "
             "render both halves without cropping to what is seen"
         )
     pairs: dict[str, Any] = {"color": (half_a.buffers["color"], half_b.buffers["color"])}
@@ -95,12 +108,36 @@ def load(sources: Sources) -> Loaded:
         taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
     if sources.denoised:
         pairs["denoised_full"] = _color_of(sources.denoised, (height, width))
-    return Loaded(Frame(**pairs), half_a, taken)
+    return Loaded(Frame(**pairs), Origin(sources.a, taken, stamp))
+
+
+class _Half(NamedTuple):
+    """What is kept of a half: tensors, which the frame takes over without a copy."""
+
+    buffers: dict[str, Tensor]
+    taken: dict[str, list[str]]
+    window: tuple[int, ...]  # of the colour's data
+
+
+def _half(path: str, mapping: Mapping[str, str] | None = None) -> _Half:
+    half = exr.load_half(path, mapping=mapping)
+    used = {role: torch.from_numpy(buffer) for role, buffer in half.buffers.items() if role != "alpha"}
+    window = half.file.parts[half.file.place(half.taken["color"][0])[0]].data_window
+    return _Half(used, half.taken, tuple(window))
+
+
+def _stamp(path: str) -> tuple[int, int, int]:
+    file = path.partition("::")[0]
+    try:
+        found = os.stat(file)
+    except OSError as error:
+        raise FileError(f"{file}: expected an OpenEXR file, but got: {error.strerror}") from None
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def save(
     path: str,
-    loaded: Loaded,
+    origin: Origin,
     result: Result,
     *,
     settings: Settings,
@@ -111,10 +148,15 @@ def save(
 
     Returns:
         how many values lay beyond the range of half floats and were clipped, where the file holds those.
+
+    Raises:
+        FileError: half a has changed since it was read, or the output cannot be written.
     """
+    if _stamp(origin.path) != origin.stamp:
+        raise FileError(f"{origin.path}: expected the file that was read, but got one changed since; run again")
     attributes = {"selfcorrect/settings": json.dumps(settings.to_dict()), "selfcorrect/run": json.dumps(dict(details))}
-    names = loaded.source.taken["color"]
-    return exr.write(path, loaded.source.file, result.image, names, attributes, extra=extra)
+    file = exr.read(origin.path)
+    return exr.write(path, file, result.image, origin.taken["color"], attributes, extra=extra)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +214,7 @@ def _same_file(a: Path, b: Path) -> bool:
     return a.exists() and b.exists() and os.path.samefile(a, b)
 
 
-def _denoised(sources: Sources, half_a: exr.Half, half_b: exr.Half) -> tuple[Any, Any] | None:
+def _denoised(sources: Sources, half_a: _Half, half_b: _Half) -> tuple[Any, Any] | None:
     """The denoised halves that the user named, else those that lie beside the halves."""
     size = half_a.buffers["color"].shape[:2]
     if sources.denoised_a and sources.denoised_b:
@@ -183,7 +225,7 @@ def _denoised(sources: Sources, half_a: exr.Half, half_b: exr.Half) -> tuple[Any
 
 
 def _color_of(path: str, size: tuple[int, ...]) -> Any:
-    color = exr.load_half(path).buffers["color"]
+    color = _half(path).buffers["color"]
     if color.shape[:2] != size:
         raise FrameError(
             f"{path}: expected {size[1]}x{size[0]} pixels like the halves, but got {color.shape[1]}x{color.shape[0]}"

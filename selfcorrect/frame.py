@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from selfcorrect.bands import bands
 from selfcorrect.errors import FrameError
 
 __all__ = ["Frame", "Half", "Repairs", "mean", "repaired"]
@@ -16,6 +17,7 @@ __all__ = ["Frame", "Half", "Repairs", "mean", "repaired"]
 Pair = tuple[Any, Any]
 _CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 1, "depth": 1}
 _RADIANCE = ("color", "denoised", "denoised_full")
+_FEATURES = ("albedo", "normal", "visibility", "depth")
 
 
 class Repairs(NamedTuple):
@@ -26,7 +28,7 @@ class Repairs(NamedTuple):
 
 
 class Half(NamedTuple):
-    """The buffers of one half, (H, W, C) float32; None where the frame has no such buffer."""
+    """The buffers of one half, (H, W, C) like the frame's; None where the frame has no such buffer."""
 
     color: Tensor
     denoised: Tensor | None
@@ -41,7 +43,8 @@ class Frame:
     """One frame as two independent halves a and b, each with half of the samples.
 
     Every buffer is a pair of (H, W, C) float arrays, NumPy or torch; (H, W) will do for one channel. They become
-    float32 tensors. Pixels that are NaN or infinite are filled from their finite neighbours, negative radiance
+    float32 tensors; G-buffers of half floats stay what they are, and take half the memory. A tensor that needs no
+    change is not copied. Pixels that are NaN or infinite are filled from their finite neighbours, negative radiance
     is clipped at 0 (as published), and both are counted in ``repairs``.
 
     Args:
@@ -75,7 +78,7 @@ class Frame:
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
                 raise FrameError(f"expected {name} as a pair of arrays (half a, half b), but got {type(pair).__name__}")
             if name == "color":
-                object.__setattr__(self, "_like", pair[0])
+                object.__setattr__(self, "_like", _empty_like(pair[0]))
             self._set(name, tuple(pair))
         if self.denoised_full is not None:
             self._set("denoised_full", (self.denoised_full,))
@@ -86,7 +89,7 @@ class Frame:
         tensors, counts = [], Repairs(0, 0)
         for half, array in zip("ab", arrays, strict=False):
             what = name if name == "denoised_full" else f"{name} of half {half}"
-            tensor = _as_tensor(array, what, _CHANNELS.get(name, 3))
+            tensor = _as_tensor(array, what, _CHANNELS.get(name, 3), half=name in _FEATURES)
             if size is not None and tensor.shape[:2] != size:
                 raise FrameError(
                     f"expected {what} of {size[1]}x{size[0]} pixels like the colour of half a, "
@@ -120,8 +123,9 @@ class Frame:
         """This frame with each half denoised on its own, with its own G-buffers.
 
         Args:
-            denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors; if its ``dual`` is True,
-                once as ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs of them.
+            denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors, first of the mean;
+                albedo and normal may be of half floats. If its ``dual`` is True, it is called once, as
+                ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs.
             full: also denoise the mean of the halves; with a dual denoiser it is the mean of the denoised halves.
         """
         if getattr(denoiser, "dual", False):
@@ -129,11 +133,13 @@ class Frame:
             pair = denoiser.pair(self.color, **features)  # type: ignore[attr-defined]  # only a dual one has it
             return self.with_denoised(pair, mean(pair) if full else None)
         inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
+        denoised_full = None
+        if full:  # first: there is no other denoised image in memory yet
+            color, albedo, normal = (None if a is None else mean((a, b)) for a, b in zip(*inputs, strict=True))
+            denoised_full = denoiser(color, albedo=albedo, normal=normal)
+            del color, albedo, normal
         pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
-        if not full:
-            return self.with_denoised(pair)
-        color, albedo, normal = (None if a is None else mean((a, b)) for a, b in zip(*inputs, strict=True))
-        return self.with_denoised(pair, denoiser(color, albedo=albedo, normal=normal))
+        return self.with_denoised(pair, denoised_full)
 
     def with_denoised(self, denoised: Pair, denoised_full: Any = None) -> "Frame":
         """This frame with these denoised images; its other buffers are not checked again."""
@@ -160,16 +166,17 @@ class Frame:
     def like_input(self, image: Tensor) -> Any:
         """``image`` as the kind of array, and on the device, that the colour of half a was given in."""
         if isinstance(self._like, Tensor):
-            limit = min(torch.finfo(self._like.dtype).max, torch.finfo(image.dtype).max)
-            return image.clamp(max=limit).to(self._like.device, self._like.dtype)
-        dtype = np.asarray(self._like).dtype
-        limit = min(float(np.finfo(dtype).max), torch.finfo(image.dtype).max)
-        return image.clamp(max=limit).cpu().numpy().astype(dtype)
+            limit = torch.finfo(self._like.dtype).max
+            return _at_most(image, limit).to(self._like.device, self._like.dtype)
+        limit = float(np.finfo(self._like.dtype).max)
+        return _at_most(image, limit).cpu().numpy().astype(self._like.dtype, copy=False)
 
 
 def mean(pair: Pair) -> Tensor:
-    """Mean of both halves; in float64, as the sum of two large values may exceed float32."""
-    average: Tensor = ((pair[0].double() + pair[1].double()) / 2).to(pair[0].dtype)
+    """Mean of both halves, float32; by way of float64, as the sum of two large values may exceed float32."""
+    average: Tensor = torch.empty_like(pair[0], dtype=torch.float32)
+    for rows in bands(len(average)):
+        average[rows] = (pair[0][rows].double() + pair[1][rows].double()) / 2
     return average
 
 
@@ -179,10 +186,20 @@ def repaired(image: Any, what: str) -> Tensor:
     Raises:
         FrameError: it has another shape or no floating-point numbers; ``what`` names it.
     """
-    return _repair(_as_tensor(image, what, 3), radiance=False)[0]
+    return _repair(_as_tensor(image, what, 3, half=False), radiance=False)[0]
 
 
-def _as_tensor(array: Any, what: str, channels: int) -> Tensor:
+def _empty_like(array: Any) -> Any:
+    """An array of the same kind, without its pixels."""
+    return array.new_empty(0) if isinstance(array, Tensor) else np.empty(0, np.asarray(array).dtype)
+
+
+def _at_most(image: Tensor, limit: float) -> Tensor:
+    """Clamped; not copied where there is nothing to do."""
+    return image if limit >= torch.finfo(image.dtype).max else image.clamp(max=limit)
+
+
+def _as_tensor(array: Any, what: str, channels: int, *, half: bool) -> Tensor:
     if isinstance(array, Tensor):
         tensor = array.detach()
     else:
@@ -198,14 +215,14 @@ def _as_tensor(array: Any, what: str, channels: int) -> Tensor:
         # what float32 cannot hold must not turn into an infinity that the render does not have
         largest = torch.finfo(torch.float32).max
         tensor = torch.where(tensor.isfinite(), tensor.clamp(-largest, largest), tensor)
-    return tensor.float()
+    return tensor if half and tensor.dtype == torch.float16 else tensor.float()
 
 
 def _repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:
     finite = image.isfinite().all(-1)
     broken = int((~finite).sum())
     if broken:
-        image = _fill(image, finite)
+        image = _fill(image.float(), finite).to(image.dtype)
     negative = int((image < 0).any(-1).sum()) if radiance else 0
     if negative:
         image = image.clamp(min=0)

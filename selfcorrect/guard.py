@@ -10,29 +10,49 @@ firefly in the witness can turn its sign. So the evidence is pooled from coarse 
 tiles of 128, 64, 32 and 16 pixels. Each level starts from what the level above found, moves as far as its own evidence
 is certain, and then takes off one standard error.
 
+The image is gone through in bands of rows (:mod:`selfcorrect.bands`): only n and d are kept for every pixel, the rest
+as means over tiles of 16 pixels. Standard errors are taken over these tiles: evidence inside one may be correlated.
+
 Measured with `scripts/bench_quality.py`; README has the numbers.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["Estimate", "Guarded", "guard", "keep_light", "trust_in_full"]
+from selfcorrect.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
+
+__all__ = ["Estimate", "Evidence", "Guarded", "Radiance", "guard", "keep_light", "trust_in_full"]
 
 _LEVELS = (128, 64, 32, 16)  # sides of the tiles
 _PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
-_ERROR_TILE = 16  # pixels whose evidence may be correlated: standard errors are taken over tiles of this side
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
-_LEAST_CERTAINTY = 1.5  # standard errors of the gain: frames that gain have 4 and more, fireflies in training give 2
 _LARGEST_SCALE = 1.02  # of the whole image, to keep its light
 _DISAGREEMENT = 0.5  # (max − min) / (max + min) of the denoised halves: one of them has left a firefly
 _BIAS_SHRINKS = 0.45  # how much of the denoiser's change with the noise is taken for a change of its bias
 
-Pair = tuple[Tensor, Tensor]
+
+class Radiance(Protocol):
+    """An image (H, W, 3) that is read a band of rows at a time: a tensor, or something that is made when it is read."""
+
+    @property
+    def shape(self) -> torch.Size:
+        """(H, W, 3)."""
+        ...
+
+    def __getitem__(self, rows: Any, /) -> Tensor:
+        """These rows."""
+        ...
+
+
+Pair = tuple[Radiance, Radiance]
 
 
 @dataclass(frozen=True)
@@ -68,60 +88,137 @@ class Guarded:
 
     Attributes:
         image: (H, W, 3), linear radiance.
-        alpha: weight of the corrected image, (H, W), 0 … 1.
         estimate: of what was gained.
-        errors: estimated relative squared error of each pixel of the denoised image and of the blend, smoothed over
-            16 pixels, (2, H, W).
+        tiles: α, and the relative squared error before and after, over tiles of 16 pixels, (3, h, w).
     """
 
     image: Tensor
-    alpha: Tensor
     estimate: Estimate
-    errors: Tensor
+    tiles: Tensor
+
+    def maps(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Each (H, W): the weight of the corrected image, 0 … 1, and the estimated relative squared error of the
+        denoised image and of the blend, smoothed over 16 pixels.
+        """
+        alpha, before, after = enlarged(self.tiles, (self.image.shape[0], self.image.shape[1])).clamp_(min=0)
+        return alpha, before, after
 
 
-def guard(
-    color: Pair, denoised: Pair, corrected: Pair, denoised_full: Tensor, corrected_full: Tensor, *, scale: float = 1.0
-) -> Guarded:
-    """Blend the corrected image into the denoised one as far as the halves bear it out.
+class Evidence:
+    """n and d of both directions at every pixel, gathered as the corrected halves are inferred.
 
     Args:
         color: noisy halves, (H, W, 3) each, linear radiance of a mean near 1.
         denoised: denoised halves.
-        corrected: each half corrected with its own denoised half: no half has seen its witness but through the
-            network's 20,303 weights.
+    """
+
+    def __init__(self, color: Pair, denoised: Pair):
+        self.color, self.denoised = color, denoised
+        self.size = (color[0].shape[0], color[0].shape[1])
+        self._usual = [tile_means(self.size[0], partial(_log_level, half)) for half in denoised]
+        self._nd = torch.zeros(2, 2, *self.size, device=self._usual[0].device)  # direction, n or d
+        self._rows = 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether every row has been gathered."""
+        return self._rows == self.size[0]
+
+    def add(self, rows: slice, corrected: tuple[Tensor, Tensor]) -> None:
+        """Gather from rows of the halves, each corrected with its own denoised half.
+
+        No half may have seen its witness but through the network's 20,303 weights.
+        """
+        self._rows += rows.stop - rows.start
+        for part in bands(rows.stop - rows.start):
+            band = slice(rows.start + part.start, rows.start + part.stop)
+            y, z = self.y(band), self.z(band)
+            for i in (0, 1):
+                change = corrected[i][part].double() - z[i]
+                weight = self.weight(i, band)
+                self._nd[i, 0, band] = weight * ((y[1 - i] - z[i]) * change).mean(-1)
+                self._nd[i, 1, band] = weight * (change**2).mean(-1)
+
+    def y(self, rows: slice) -> list[Tensor]:
+        """The noisy halves."""
+        return [half[rows].double() for half in self.color]
+
+    def z(self, rows: slice) -> list[Tensor]:
+        """The denoised halves."""
+        return [half[rows].double() for half in self.denoised]
+
+    def nd(self, i: int, rows: slice) -> Tensor:
+        """n and d of one direction, (2, rows, W)."""
+        return self._nd[i, :, rows].double()
+
+    def both(self, rows: slice) -> Tensor:
+        """n and d of both directions together."""
+        return self.nd(0, rows) + self.nd(1, rows)
+
+    def weight(self, i: int, rows: slice) -> Tensor:
+        """What one direction's evidence is multiplied by.
+
+        It must not know the witness: low where the witness is high, it would reward darkening. And a firefly that the
+        denoiser has left is a large error in a dark place; its own radiance would give it no weight. So a pixel counts
+        for its own radiance, but at most for the usual one around it.
+        """
+        usual = enlarged_rows(self._usual[i], self.size, rows)[0].exp()
+        return 1.0 / (torch.minimum(self.denoised[i][rows].double().mean(-1), usual) ** 2 + 0.01)
+
+
+def _log_level(radiance: Radiance, rows: slice) -> Tensor:
+    return radiance[rows].double().mean(-1).clamp(min=_DARKEST).log()[None]
+
+
+def guard(evidence: Evidence, denoised_full: Radiance, image: Tensor, *, scale: float = 1.0) -> Guarded:
+    """Blend the corrected image into the denoised one as far as the halves bear it out.
+
+    Args:
+        evidence: of every row.
         denoised_full: denoised mean of the halves.
-        corrected_full: the corrected image to blend in.
+        image: the corrected image to blend in, (H, W, 3); it becomes the blend, in place.
         scale: what the radiance was multiplied by; the estimate is that of the frame before.
     """
-    y, z, g = ((pair[0].double(), pair[1].double()) for pair in (color, denoised, corrected))
-    full = denoised_full.double()
-    change = [g[i] - z[i] for i in (0, 1)]
-    # The weight must not know the witness: low where the witness is high, it would reward darkening.
-    weight = [1.0 / (_level(z[i]) ** 2 + 0.01) for i in (0, 1)]
-    n = [weight[i] * ((y[1 - i] - z[i]) * change[i]).mean(-1) for i in (0, 1)]
-    d = [weight[i] * (change[i] ** 2).mean(-1) for i in (0, 1)]
+    size = evidence.size
+    chosen = [_pooled(size, partial(evidence.nd, i)) for i in (0, 1)]
 
-    # What one direction alone would choose is judged by the witness of the other.
-    gain, unweighted = torch.zeros_like(n[0]), torch.zeros_like(n[0])
-    for i in (0, 1):
-        chosen = _pooled(n[i], d[i])
-        judged = chosen * n[1 - i] - chosen**2 * d[1 - i] / 2
-        gain += judged
-        unweighted += judged / weight[1 - i]
+    def judged(rows: slice) -> tuple[Tensor, Tensor]:
+        """What one direction alone would choose is judged by the witness of the other: the gain, with and without w."""
+        gain, unweighted = [], []
+        for i in (0, 1):
+            alpha = enlarged_rows(chosen[i], size, rows)[0]
+            n, d = evidence.nd(1 - i, rows)
+            gain.append(alpha * n - alpha**2 * d / 2)
+            unweighted.append(gain[i] / evidence.weight(1 - i, rows))
+        return gain[0] + gain[1], unweighted[0] + unweighted[1]
+
+    def gains(rows: slice) -> Tensor:
+        gain, unweighted = judged(rows)
+        return torch.stack([gain, _metric_weight(denoised_full[rows].double(), scale) * unweighted])
+
+    gain = tile_means(size[0], gains)
     # More than chance, in the weights that decide and in those of the metric.
-    in_metric = _metric_weight(full, scale) * unweighted
-    improved = _certainty(gain) > 1 and _certainty(in_metric) > _LEAST_CERTAINTY
+    improved = all(mean > _standard_error(tiles) for mean, tiles in zip(average(gain, size), gain, strict=True))
 
-    alpha = _pooled(n[0] + n[1], d[0] + d[1]) if improved else torch.zeros_like(gain)
-    image = full + alpha[..., None] * (corrected_full.double() - full)
-    # The best image there is says what errors are relative to: where the denoiser has left fireflies or blurred
-    # a lamp, its own radiance would hide its error.
-    own = _metric_weight(_shown(image), scale)
-    estimate, errors = _estimate(y, z, full, own, own * unweighted if improved else torch.zeros_like(gain), improved)
-    dtype = denoised_full.dtype
-    errors = errors.clamp(0, torch.finfo(dtype).max)
-    return Guarded(image.to(dtype), alpha.to(dtype), estimate, errors.to(dtype))
+    alpha = _pooled(size, evidence.both) if improved else torch.zeros_like(gain[:1, :1, :1])
+    for rows in bands(size[0]):
+        full = denoised_full[rows].double()
+        image[rows] = full + enlarged_rows(alpha, size, rows)[0, :, :, None] * (image[rows].double() - full)
+
+    def squares(rows: slice) -> Tensor:
+        """Mean squared differences, and the gain, by which :func:`_estimate` knows errors."""
+        y, z, full = evidence.y(rows), evidence.z(rows), denoised_full[rows].double()
+        between = ((y[0] - y[1]) ** 2).mean(-1)
+        crossed = ((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2).mean(-1) / 2
+        spread = ((z[0] - z[1]) ** 2).mean(-1)
+        nonlinear = (((z[0] + z[1]) / 2 - full) ** 2).mean(-1)
+        gained = judged(rows)[1] if improved else torch.zeros_like(spread)
+        # The best image there is says what errors are relative to: where the denoiser has left fireflies or blurred
+        # a lamp, its own radiance would hide its error.
+        return _metric_weight(_shown(image, rows), scale) * torch.stack([between, crossed, spread, nonlinear, gained])
+
+    estimate, errors = _estimate(tile_means(size[0], squares), size, improved)
+    return Guarded(image, estimate, torch.cat([alpha.expand(1, *errors.shape[1:]), errors]))
 
 
 def _metric_weight(radiance: Tensor, scale: float) -> Tensor:
@@ -129,136 +226,119 @@ def _metric_weight(radiance: Tensor, scale: float) -> Tensor:
     return 1.0 / (radiance.mean(-1) ** 2 + 0.01 * scale**2)
 
 
-def _shown(radiance: Tensor) -> Tensor:
+def _shown(image: Tensor, rows: slice) -> Tensor:
     """Radiance to weigh errors by: a pixel clipped to black amid bright ones is taken for an eighth of them."""
+    wide, inner = widened(rows, 1, image.shape[0])
+    radiance = image[wide].double()
     around = F.avg_pool2d(radiance.permute(2, 0, 1), 3, 1, 1, count_include_pad=False).permute(1, 2, 0)
-    return torch.maximum(radiance, around / 8)
+    return torch.maximum(radiance, around / 8)[inner]
 
 
-def _estimate(
-    y: Pair, z: Pair, full: Tensor, weight: Tensor, gained: Tensor, improved: bool
-) -> tuple[Estimate, Tensor]:
-    """What the guard tells, and maps of the error before and after, (2, H, W).
+def _estimate(squares: Tensor, size: tuple[int, int], improved: bool) -> tuple[Estimate, Tensor]:
+    """What the guard tells, and the error before and after, over tiles, (2, h, w).
+
+    ``squares`` are the tile means of weighted squared differences: between the noisy halves, crossed (each denoised
+    half and its witness), the spread of the denoised halves, between their mean and the full buffer; and the gain.
 
     The error of a denoised half is known without bias (Eq. 6): E‖z^a − y^b‖² is that error plus the variance of y^b.
     It consists of variance, half of the spread V between the halves, and bias. The full buffer has half the variance.
     Its bias is smaller too, unless the denoiser is linear; then the full buffer is the mean of the halves. How far it
     is not tells by how much.
     """
-    between = weight * ((y[0] - y[1]) ** 2).mean(-1)
-    crossed = weight * ((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2).mean(-1) / 2
-    spread = weight * ((z[0] - z[1]) ** 2).mean(-1)
-    nonlinear = weight * (((z[0] + z[1]) / 2 - full) ** 2).mean(-1)
-    v = float(spread.mean())
-    bias = max(float((crossed - between / 2).mean()) - v / 2, 0.0)
-    left = max(1 - _BIAS_SHRINKS * math.sqrt(float(nonlinear.mean()) / bias), 0.0) if bias > 0 else 0.0
-    half = max(bias + v / 2, float(gained.mean()))
+    between, crossed, v, nonlinear, gained = average(squares, size)
+    bias = max(crossed - between / 2 - v / 2, 0.0)
+    left = max(1 - _BIAS_SHRINKS * math.sqrt(nonlinear / bias), 0.0) if bias > 0 else 0.0
+    half = max(bias + v / 2, gained)
     denoised = left * bias + v / 4
-    ratio = float(gained.mean()) / half if half > 0 else 0.0
-    before = left * (crossed - between / 2 - spread / 2) + spread / 4
-    after = before - gained * (denoised / half if half > 0 else 0.0)
+    ratio = gained / half if half > 0 else 0.0
     estimate = Estimate(
-        noisy=float(between.mean()) / 4,
+        noisy=between / 4,
         denoised=denoised,
         corrected=denoised * (1 - ratio),
         change=-ratio,
-        standard_error=_tile_error(gained) / half if half > 0 else 0.0,
+        standard_error=_standard_error(squares[4]) / half if half > 0 else 0.0,
         improved=improved,
     )
-    return estimate, torch.stack([_smooth(before), _smooth(after)])
+    before = left * (squares[1] - squares[0] / 2 - squares[2] / 2) + squares[2] / 4
+    after = before - squares[4] * (denoised / half if half > 0 else 0.0)
+    return estimate, torch.stack([before, after])
 
 
-def _pooled(n: Tensor, d: Tensor) -> Tensor:
-    """α of each pixel from evidence pooled over the frame, then over ever smaller tiles."""
+def _pooled(size: tuple[int, int], nd: Callable[[slice], Tensor]) -> Tensor:
+    """α over the smallest tiles, (1, h, w), from evidence pooled over the frame, then over ever smaller tiles."""
     floor = torch.finfo(torch.float64).tiny
-    certain = n.mean() - _tile_error(n)
-    alpha = (certain / d.mean().clamp(min=floor)).clamp(0, 1).expand_as(n)
+    tiles = tile_means(size[0], nd)
+    n, d = average(tiles, size)
+    alpha = tiles.new_tensor((n - _standard_error(tiles[0])) / max(d, floor)).clamp(0, 1).reshape(1, 1, 1)
     for side in _LEVELS:
-        if side > max(n.shape):
+        if side > max(size):
             continue
-        around = _means(alpha, side)
-        evidence, curvature = _means(n, side), _means(d, side)
-        variance = _means((n - alpha * d) ** 2, side) / side**2
+        evidence, curvature, around, scatter = tile_means(size[0], partial(_moments, size, nd, alpha), side)
+        variance = scatter / side**2
         ridge = variance / (_PRIOR_VARIANCE * curvature).clamp(min=floor)
         moved = (evidence + ridge * around - variance.sqrt()) / (curvature + ridge).clamp(min=floor)
-        alpha = F.interpolate(moved.clamp(0, 1)[None, None], size=n.shape, mode="bilinear")[0, 0]
+        alpha = moved.clamp(0, 1)[None]
     return alpha
 
 
-def _means(image: Tensor, side: int) -> Tensor:
-    """Means over tiles; those at the far border are smaller."""
-    return F.avg_pool2d(image[None, None], side, ceil_mode=True, count_include_pad=False)[0, 0]
+def _moments(size: tuple[int, int], nd: Callable[[slice], Tensor], alpha: Tensor, rows: slice) -> Tensor:
+    """What a level needs the means of: n, d, the α of the level above, and the squared rest that this α leaves."""
+    (n, d), around = nd(rows), enlarged_rows(alpha, size, rows)[0]
+    return torch.stack([n, d, around, (n - around * d) ** 2])
 
 
-def _tile_error(image: Tensor) -> float:
-    """Standard error of the mean, over tiles as independent draws; of a single tile, the mean's own size."""
-    tiles = _means(image, _ERROR_TILE).flatten()
-    if len(tiles) == 1:
+def _standard_error(tiles: Tensor) -> float:
+    """Of the mean, over tiles as independent draws; of a single tile, the mean's own size."""
+    if tiles.numel() == 1:
         return float(tiles.abs())
-    return float(tiles.std()) / math.sqrt(len(tiles))
+    return float(tiles.std()) / math.sqrt(tiles.numel())
 
 
-def _certainty(image: Tensor) -> float:
-    """The mean in units of its standard error."""
-    mean, error = float(image.mean()), _tile_error(image)
-    return mean / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
-
-
-def _level(radiance: Tensor) -> Tensor:
-    """Radiance that the relative error counts from, (H, W): each pixel's own, at most the usual one around it.
-
-    A firefly that the denoiser has left is a large error in a dark place; its own radiance would give it no weight.
-    """
-    level = radiance.mean(-1)
-    around = _smooth(level.clamp(min=_DARKEST).log()).exp()
-    return torch.minimum(level, around)
-
-
-def _smooth(image: Tensor) -> Tensor:
-    means = _means(image, _ERROR_TILE)
-    return F.interpolate(means[None, None], size=image.shape, mode="bilinear")[0, 0]
-
-
-def trust_in_full(denoised: Pair, denoised_full: Tensor, *, scale: float = 1.0) -> Tensor:
-    """How far the full buffer's denoised image may stand in for the halves' own, (H, W, 1), 0 … 1.
+def trust_in_full(denoised: Pair, denoised_full: Radiance, rows: slice) -> Tensor:
+    """How far the full buffer's denoised image may stand in for the halves' own, (rows, W, 1), 0 … 1.
 
     It is the better input, but a firefly that the denoiser has left in one half is in the full buffer too; with their
     own images only one of the corrected halves has it. So not where the halves differ by more than a factor of three,
     unless the full buffer sides with the darker one.
     """
-    a, b, full = (scale * image.double().mean(-1) for image in (*denoised, denoised_full))
+    wide, inner = widened(rows, 4, denoised_full.shape[0])
+    a, b, full = (image[wide].double().mean(-1) for image in (*denoised, denoised_full))
     middle, half = (a + b) / 2, (a - b).abs() / 2
     left_in_one = half > _DISAGREEMENT * middle.clamp(min=_DARKEST / 10)
     sides_with_darker = (2 * (middle - full) / half.clamp(min=torch.finfo(torch.float64).tiny)).clamp(0, 1)
     doubt = torch.where(left_in_one, 1 - sides_with_darker, 0.0)[None, None]
     around = F.max_pool2d(doubt, 5, 1, 2)
-    return 1 - F.avg_pool2d(around, 5, 1, 2, count_include_pad=False)[0, 0][..., None]
+    return 1 - F.avg_pool2d(around, 5, 1, 2, count_include_pad=False)[0, 0, inner, :, None]
 
 
-def keep_light(image: Tensor, denoised: Tensor, color: Pair) -> Tensor:
-    """Bring the image's mean radiance to within three standard errors of the noisy mean.
+def keep_light(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:
+    """Bring the image's mean radiance to within three standard errors of the noisy mean, in place.
 
     Corrections learned from a loss that has not seen every bright path lose light; the noisy mean has not. Small
     losses are scaled away. For what two per cent of scaling do not reach, light comes back from where the denoised
     image has kept more of it, smoothed over 16 pixels, so that its fireflies stay away.
     """
-    noisy = (color[0].double() + color[1].double()) / 2
-    mean, target, kept = (float(x.double().mean()) for x in (image, noisy, denoised))
-    within = _LIGHT_TOLERANCE * _error_of_mean(color)
+    size = (image.shape[0], image.shape[1])
+
+    def means(rows: slice) -> Tensor:
+        a, b = (half[rows].double().mean(-1) for half in color)
+        shown = (x[rows].double().mean(-1) for x in (image, denoised))
+        return torch.stack([*shown, (a + b) / 2, ((a - b) / 2) ** 2])
+
+    mean, kept, target, variance = average(tile_means(size[0], means), size)
+    within = _LIGHT_TOLERANCE * math.sqrt(variance / (size[0] * size[1]))
     if mean <= 0 or abs(mean - target) <= within:
         return image
     wanted = target + within if mean > target else target - within
-    result = image.double()
     if abs(kept - target) < abs(mean - target):
         reachable = min(max(mean, wanted / _LARGEST_SCALE), wanted * _LARGEST_SCALE)
         share = min(1.0, (reachable - mean) / (kept - mean))
-        lost = (denoised.double() - result).unbind(-1)
-        result = (result + share * torch.stack([_smooth(channel) for channel in lost], -1)).clamp(min=0)
-    scale = min(max(wanted / float(result.mean()), 1 / _LARGEST_SCALE), _LARGEST_SCALE)
-    return (result * scale).to(image.dtype)
-
-
-def _error_of_mean(color: Pair) -> float:
-    """Standard error of the mean radiance of both halves."""
-    difference = (color[0].double() - color[1].double()).mean(-1) / 2
-    return math.sqrt(float((difference**2).mean()) / difference.numel())
+        lost = tile_means(size[0], lambda rows: (denoised[rows].double() - image[rows].double()).permute(2, 0, 1))
+        for rows in bands(size[0]):
+            returned = share * enlarged_rows(lost, size, rows).permute(1, 2, 0)
+            image[rows] = (image[rows].double() + returned).clamp(min=0)
+        (mean,) = average(tile_means(size[0], lambda rows: image[rows].double().mean(-1)[None]), size)
+    scale = min(max(wanted / mean, 1 / _LARGEST_SCALE), _LARGEST_SCALE)
+    for rows in bands(size[0]):
+        image[rows] = image[rows].double() * scale
+    return image

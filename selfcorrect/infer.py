@@ -10,7 +10,7 @@ from selfcorrect.kernel import Guides, cross_bilateral
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 
-__all__ = ["infer", "infer_tile", "tiles"]
+__all__ = ["TILE", "infer", "infer_tile", "tiles"]
 
 TILE = 512  # pixels; the network reads 9 more on each side, so that 7 % of the work is done twice
 
@@ -36,6 +36,7 @@ def infer(
     scale: float = 1.0,
     denoised: Tensor | None = None,
     side: int = TILE,
+    rows: slice | None = None,
 ) -> Tensor:
     """The corrected half, (H, W, 3), of radiance times ``scale``; the same bits whatever the tiles' side.
 
@@ -46,11 +47,12 @@ def infer(
         scale: what radiance is multiplied by.
         denoised: another denoised image than the half's own.
         side: of the tiles, pixels.
+        rows: those wanted, by default all.
     """
-    size = (half.color.shape[0], half.color.shape[1])
-    image = half.color.new_empty(*size, 3)
-    for region in tiles(size, side):
-        top, left, bottom, right = region
+    first, beyond = (0, half.color.shape[0]) if rows is None else (rows.start, rows.stop)
+    image = half.color.new_empty(beyond - first, half.color.shape[1], 3)
+    for top, left, bottom, right in tiles((image.shape[0], image.shape[1]), side):
+        region = (first + top, left, first + bottom, right)
         image[top:bottom, left:right] = infer_tile(network, half, settings, region, scale=scale, denoised=denoised)
     return image
 

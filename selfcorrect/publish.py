@@ -28,7 +28,7 @@ _NAME = re.compile(r"\..*\.[0-9a-f]{16}\.selfcorrect-tmp")
 _OLD = 24 * 3600  # seconds
 
 
-def publish(target: Path, data: bytes | bytearray) -> None:
+def publish(target: Path, data: bytes | bytearray | memoryview) -> None:
     """Write a file; an existing one survives any failure.
 
     Raises:

@@ -273,3 +273,27 @@ class TestBadInput:
         assert "3" in line
         assert out.read_bytes() == b"precious"
         assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "b.exr", "out.exr"]
+
+
+def test_a_half_that_changes_meanwhile_is_refused(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    """What passes through is read again at the end: it must be of the same file."""
+    (tmp_path / "late.py").write_text(
+        "import pathlib\n"
+        "class Late:\n"
+        "    name, features = 'late', frozenset()\n"
+        "    def denoise(self, color, albedo, normal):\n"
+        f"        pathlib.Path({str(halves[0])!r}).touch()\n"
+        "        return color\n"
+    )
+    out = tmp_path / "out.exr"
+    options = ["--steps", "1", "--patch", "16", "--window", "5", "--denoiser", f"{tmp_path / 'late.py'}:Late"]
+    line = refused("frame", *halves, "-o", out, *options)
+    assert "a.exr: expected the file that was read" in line
+    assert not out.exists()
+
+
+def test_a_frame_beyond_maxmem_is_refused_before_the_work(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    line = refused("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--maxmem", "100M")
+    assert "a.exr: expected --maxmem of at least" in line
+    assert "6 apples" in refused("frame", *halves, "-o", tmp_path / "out.exr", "--maxmem", "6 apples")
+    assert run("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--maxmem", "2G").returncode == 0

@@ -115,6 +115,16 @@ class TestJointBilateral:
 
 
 class TestOidn:
+    def test_less_scratch_gives_the_same_bits(self) -> None:
+        color, albedo, normal = image(600, 700), image(600, 700, 1) * 1.4 - 0.2, image(600, 700, 2) * 2.6 - 1.3
+        whole = Oidn(1).denoise(color, albedo.clamp(0, 1), normal.clamp(-1, 1))
+        assert torch.equal(Oidn(1, scratch=1).denoise(color, albedo, normal), whole), "OIDN clamps by itself"
+
+    def test_half_floats_are_read_where_they_are(self) -> None:
+        color, albedo, normal = image(64, 48), image(64, 48, 1).half(), image(64, 48, 2).half()
+        denoise = denoisers.create("oidn", threads=1)
+        assert torch.equal(denoise(color, albedo, normal), denoise(color, albedo.float(), normal.float()))
+
     def test_it_denoises(self) -> None:
         clean = 1 + image(1, 1).expand(64, 64, 3)
         noisy = clean * -torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(1)).log()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from selfcorrect import Frame
 from selfcorrect.errors import FrameError
-from selfcorrect.frame import Repairs
+from selfcorrect.frame import Repairs, mean
 
 
 def pair(shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:
@@ -110,8 +110,8 @@ def test_denoise_hands_each_half_its_own_buffers() -> None:
     assert frame.denoised is None
     torch.testing.assert_close(denoised.denoised[1], frame.color[1] / 2)
     torch.testing.assert_close(denoised.denoised_full, (frame.color[0] + frame.color[1]) / 4)
-    assert torch.equal(calls[1][1], frame.albedo[1])
-    assert torch.equal(calls[2][1], (frame.albedo[0] + frame.albedo[1]) / 2)
+    assert torch.equal(calls[0][1], (frame.albedo[0] + frame.albedo[1]) / 2)
+    assert torch.equal(calls[2][1], frame.albedo[1])
     assert calls[0][2] is None
 
 
@@ -124,3 +124,16 @@ def test_result_is_like_the_input(dtype: type) -> None:
     tensor = Frame(color=tuple(torch.from_numpy(x.astype(dtype)) for x in pair((4, 5, 3)))).like_input(image)
     assert isinstance(tensor, torch.Tensor)
     assert tensor.numpy().dtype == dtype
+
+
+def test_g_buffers_of_half_floats_are_kept_and_their_mean_is_not_rounded() -> None:
+    albedo = tuple(torch.from_numpy(x).half() for x in pair((4, 5, 3)))
+    albedo[0][1, 2] = torch.inf
+    frame = Frame(color=tuple(x.astype(np.float16) for x in pair((4, 5, 3))), albedo=albedo)
+    assert (frame.color[0].dtype, frame.albedo[0].dtype) == (torch.float32, torch.float16)
+    assert frame.albedo[1].data_ptr() == albedo[1].data_ptr()
+    assert frame.albedo[0].isfinite().all()
+    assert frame.repairs["albedo"].non_finite == 1
+    expected = (frame.albedo[0].double() + frame.albedo[1].double()) / 2
+    assert torch.equal(mean(frame.albedo), expected.float())
+    assert not torch.equal(expected.half().double(), expected)

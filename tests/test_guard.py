@@ -4,9 +4,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from selfcorrect.guard import Guarded, guard, keep_light
+from selfcorrect import bands
+from selfcorrect.guard import Evidence, Guarded, Pair, keep_light, trust_in_full
+from selfcorrect.guard import guard as guard_by_evidence
 
 SIZE = (160, 192)
+
+Halves = tuple[Tensor, Tensor]
 
 
 def scene(seed: int = 0) -> Tensor:
@@ -34,6 +38,13 @@ def run(corrected_error: Tensor, *, sigma: float = 0.5, seed: int = 0, fireflies
     corrected = [truth + corrected_error + noise(0.02, 10 * seed + i) for i in (5, 6)]
     full, corrected_full = ((pair[0] + pair[1]) / 2 for pair in (denoised, corrected))
     return guard(tuple(color), tuple(denoised), tuple(corrected), full, corrected_full), truth
+
+
+def guard(color: Pair, denoised: Pair, corrected: Halves, full: Tensor, image: Tensor, scale: float = 1.0) -> Guarded:
+    """The guard on whole corrected halves."""
+    evidence = Evidence(color, denoised)
+    evidence.add(slice(0, image.shape[0]), corrected)
+    return guard_by_evidence(evidence, full, image.clone(), scale=scale)
 
 
 def error(image: Tensor, truth: Tensor) -> float:
@@ -65,7 +76,7 @@ def test_only_the_better_part_is_taken(seed: int) -> None:
     worse = noise(1.0, 98)
     worse[:, : SIZE[1] // 2] = 0
     guarded, truth = run(worse, seed=seed)
-    left, right = guarded.alpha[:, : SIZE[1] // 2 - 16], guarded.alpha[:, SIZE[1] // 2 + 16 :]
+    left, right = guarded.maps()[0][:, : SIZE[1] // 2 - 16], guarded.maps()[0][:, SIZE[1] // 2 + 16 :]
     assert left.mean() > 0.8
     assert right.mean() < 0.15
     assert error(guarded.image, truth) < 0.7 * denoised_error()
@@ -84,7 +95,7 @@ def test_nothing_to_gain_gives_the_denoised_image() -> None:
     guarded = guard(color, denoised, denoised, scene(), scene())
     assert not guarded.estimate.improved
     assert torch.equal(guarded.image, scene())
-    assert guarded.alpha.eq(0).all()
+    assert guarded.maps()[0].eq(0).all()
     assert "no gain" in str(guarded.estimate)
 
 
@@ -98,8 +109,8 @@ def test_the_estimate_of_the_halves_is_unbiased() -> None:
         true = float((weight[..., None] * (smooth - truth) ** 2).mean())
         assert guarded.estimate.denoised == pytest.approx(true, rel=0.1)
         assert guarded.estimate.noisy == pytest.approx(float(weight.mean()) * 0.3**2 / 2, rel=0.05)
-        assert guarded.errors[0].mean() == pytest.approx(true, rel=0.15)
-        assert guarded.errors[1].mean() < 0.5 * guarded.errors[0].mean()
+        assert guarded.maps()[1].mean() == pytest.approx(true, rel=0.15)
+        assert guarded.maps()[2].mean() < 0.5 * guarded.maps()[1].mean()
 
 
 def test_the_estimate_is_in_the_units_of_the_frame() -> None:
@@ -131,3 +142,36 @@ def test_light_is_kept() -> None:
     assert torch.equal(keep_light(scene(), scene(), color), scene())
     black = torch.zeros(*SIZE, 3)
     assert torch.equal(keep_light(black, scene(), color), black)
+
+
+@pytest.mark.parametrize("improves", [True, False])
+def test_bands_of_rows_give_what_the_whole_image_gives(improves: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame of many bands, whose last tiles are smaller, with fireflies on both sides of a band's border."""
+    size = (301, 90)
+
+    def draw(sigma: float, seed: int) -> Tensor:
+        return sigma * torch.randn(*size, 3, generator=torch.Generator().manual_seed(seed))
+
+    truth = 1 + 0.3 * torch.linspace(0, 40, size[0]).sin()[:, None, None].expand(*size, 3)
+    color = (truth + draw(0.2, 1), truth + draw(0.2, 2))
+    denoised = (1 + draw(0.02, 3).abs(), 1 + draw(0.02, 4).abs())
+    denoised[0][126:130, 40] = 30
+    full = (denoised[0] + denoised[1]) / 2
+    image = truth if improves else full
+    corrected = (truth + draw(0.02, 5), truth + draw(0.02, 6)) if improves else denoised
+
+    def run() -> tuple[Guarded, Tensor, Tensor]:
+        guarded = guard(color, denoised, corrected, full, image, scale=0.7)
+        trusted = torch.cat([trust_in_full(denoised, full, rows) for rows in bands.bands(size[0])])
+        return guarded, trusted, keep_light(0.9 * guarded.image, full, color)
+
+    (banded, trusted, lit), _ = run(), monkeypatch.setattr(bands, "_BAND", 1024)
+    whole, trusted_whole, lit_whole = run()
+    assert whole.estimate.improved == improves
+    assert trusted_whole.min() < 0.1
+    assert torch.equal(trusted, trusted_whole)
+    torch.testing.assert_close(banded.image, whole.image, rtol=2e-7, atol=1e-9)
+    torch.testing.assert_close(torch.stack(banded.maps()), torch.stack(whole.maps()), rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(lit, lit_whole, rtol=2e-7, atol=1e-9)
+    for name, value in vars(whole.estimate).items():
+        assert getattr(banded.estimate, name) == pytest.approx(value, rel=1e-9), name

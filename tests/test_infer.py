@@ -161,3 +161,25 @@ def test_no_time_for_training_gives_the_denoised_image() -> None:
     result = correct(frame, Settings.preset("balanced", time_budget=1e-6))
     assert result.losses == []
     assert torch.isfinite(result.image).all()
+
+
+def test_g_buffers_of_half_floats_give_the_bits_of_floats() -> None:
+    frame = make_frame(60, 70)
+    settings = Settings.preset("balanced", steps=3, window=7, patch=32)
+    albedo = tuple(half.half() for half in frame.albedo)
+    images = []
+    for kind in (torch.float16, torch.float32):
+        given = tuple(half.to(kind) for half in albedo)
+        frame = Frame(frame.color, denoised=frame.denoised, albedo=given, denoised_full=frame.denoised_full)
+        assert frame.albedo[0].dtype == kind
+        images.append(correct(frame, settings).image)
+    assert torch.equal(*images)
+
+
+def test_strips_of_rows_give_the_bits_of_the_whole_image() -> None:
+    frame = make_frame(90, 40)
+    settings = Settings.preset("balanced")
+    network = make_network(frame, settings)
+    whole = infer(network, frame.halves[0], settings)
+    strips = [infer(network, frame.halves[0], settings, rows=slice(top, min(top + 32, 90))) for top in (0, 32, 64)]
+    assert torch.equal(torch.cat(strips), whole)

@@ -70,7 +70,9 @@ class Guides:
 
         def cut(buffer: Tensor, factor: float = 1.0) -> Tensor:
             part = buffer.index_select(0, rows).index_select(1, columns).permute(2, 0, 1)
-            return (part.double() * factor).clamp(-LARGEST, LARGEST).float() if factor != 1.0 else part
+            if factor != 1.0:
+                return (part.double() * factor).clamp(-LARGEST, LARGEST).float()
+            return part.float() if part.dtype == torch.float16 else part
 
         parts = [cut(color, scale), *(cut(b) for b in (albedo, visibility, normal) if b is not None)]
         planes = torch.cat([*parts, cut(denoised, scale)]).clamp_(-LARGEST, LARGEST)

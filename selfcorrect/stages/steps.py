@@ -10,13 +10,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from selfcorrect.bands import Scaled, scaled
 from selfcorrect.frame import Half, mean
-from selfcorrect.kernel import LARGEST
 from selfcorrect.settings import Settings
 from selfcorrect.stages import james_stein as js
 from selfcorrect.stages import regression
 
 __all__ = ["State", "james_stein", "regress"]
+
+_FEATURES = ("albedo", "normal", "visibility", "depth")
 
 
 class State(NamedTuple):
@@ -45,6 +47,16 @@ class State(NamedTuple):
         """The halves' noisy radiance."""
         return self.halves[0].color, self.halves[1].color
 
+    @property
+    def scaled_color(self) -> tuple[Scaled, Scaled]:
+        """The noisy radiance times ``scale``, made where it is read."""
+        return Scaled(self.halves[0].color, self.scale), Scaled(self.halves[1].color, self.scale)
+
+    @property
+    def scaled_images(self) -> tuple[Scaled, Scaled]:
+        """The halves' images so far, times ``scale``, made where they are read."""
+        return Scaled(self.images[0], self.scale), Scaled(self.images[1], self.scale)
+
     def then(self, images: tuple[Tensor, Tensor], full: Tensor) -> "State":
         """The state after a step that gave these images."""
         a, b = (half._replace(denoised=image) for half, image in zip(self.halves, images, strict=True))
@@ -53,20 +65,13 @@ class State(NamedTuple):
     def scaled(self) -> "State":
         """The state with radiance times ``scale``, and bounded so that squares stay finite."""
 
-        def one(half: Half) -> Half:
-            assert half.denoised is not None  # see images
-            return half._replace(color=_bounded(half.color, self.scale), denoised=_bounded(half.denoised, self.scale))
+        def one(half: Half, color: Scaled, image: Scaled) -> Half:
+            # the G-buffers may be half floats
+            features = {name: None if (b := getattr(half, name)) is None else b.float() for name in _FEATURES}
+            return half._replace(color=color[:], denoised=image[:], **features)
 
-        return State((one(self.halves[0]), one(self.halves[1])), _bounded(self.full, self.scale))
-
-
-def _bounded(radiance: Tensor, scale: float) -> Tensor:
-    return (radiance.double() * scale).clamp(max=LARGEST).float()
-
-
-def _unscaled(radiance: Tensor, scale: float) -> Tensor:
-    largest = torch.finfo(torch.float32).max
-    return (radiance.double() / scale).clamp(-largest, largest).float()
+        a, b = (one(*each) for each in zip(self.halves, self.scaled_color, self.scaled_images, strict=True))
+        return State((a, b), Scaled(self.full, self.scale)[:])
 
 
 def regress(state: State, settings: Settings) -> State:
@@ -77,9 +82,9 @@ def regress(state: State, settings: Settings) -> State:
     """
     options = {"stride": settings.regression_stride, "threads": torch.get_num_threads()}
     halves = state.scaled().halves
-    a, b = (_unscaled(image, state.scale) for image in regression.own_buffer_regression(halves, **options))
+    a, b = (scaled(image, 1 / state.scale) for image in regression.own_buffer_regression(halves, **options))
     crossed = regression.cross_buffer_regression(halves, **options)
-    return state.then((a, b), _unscaled(mean(crossed), state.scale))
+    return state.then((a, b), scaled(mean(crossed), 1 / state.scale))
 
 
 def james_stein(state: State, settings: Settings) -> State:
@@ -92,7 +97,7 @@ def james_stein(state: State, settings: Settings) -> State:
     variance = js.variance_of_mean(work.color)
 
     def shrunk(noisy: Tensor, image: Tensor, variance: Tensor) -> Tensor:
-        return _unscaled(js.james_stein(noisy, image, variance, js.relative_weight(noisy)), state.scale)
+        return scaled(js.james_stein(noisy, image, variance, js.relative_weight(noisy)), 1 / state.scale)
 
     a, b = (shrunk(noisy, image, 2 * variance) for noisy, image in zip(work.color, work.images, strict=True))
     return state.then((a, b), shrunk(mean(work.color), work.full, variance))

@@ -1,0 +1,95 @@
+"""Maps of a whole image that are never whole in memory: made a band of rows at a time, kept as means over tiles.
+
+A function of a band takes a slice of rows and gives maps (K, rows, W). Bands are as high as several of the largest
+tiles, so that no tile lies in two of them.
+"""
+
+from collections.abc import Callable, Iterator
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from selfcorrect.kernel import LARGEST
+
+__all__ = ["TILE", "Scaled", "average", "bands", "enlarged", "enlarged_rows", "scaled", "tile_means", "widened"]
+
+TILE = 16  # pixels; the side of tiles where none is given
+_BAND = 128  # rows; a multiple of every side
+
+Pixels = Callable[[slice], Tensor]
+
+
+class Scaled:
+    """An image (H, W, 3) of radiance times a factor, bounded like the guides; made where it is read, never whole."""
+
+    def __init__(self, image: Tensor, factor: float):
+        self.shape = image.shape
+        self._image, self._factor = image, factor
+
+    def __getitem__(self, rows: slice) -> Tensor:
+        return (self._image[rows].double() * self._factor).clamp(max=LARGEST).float()
+
+
+def scaled(image: Tensor, factor: float) -> Tensor:
+    """Radiance times a factor, in place; bounded by what float32 holds."""
+    largest = torch.finfo(torch.float32).max
+    for rows in bands(image.shape[0]):
+        image[rows] = (image[rows].double() * factor).clamp(-largest, largest)
+    return image
+
+
+def bands(height: int, rows: int | None = None) -> Iterator[slice]:
+    """Slices of rows that cover an image once.
+
+    >>> list(bands(200))
+    [slice(0, 128, None), slice(128, 200, None)]
+    """
+    step = rows or _BAND
+    for top in range(0, height, step):
+        yield slice(top, min(top + step, height))
+
+
+def widened(rows: slice, reach: int, height: int) -> tuple[slice, slice]:
+    """The rows with ``reach`` more on each side, inside the image; and where the rows lie in those.
+
+    >>> widened(slice(128, 200), 2, 201)
+    (slice(126, 201, None), slice(2, 74, None))
+    """
+    wide = slice(max(rows.start - reach, 0), min(rows.stop + reach, height))
+    return wide, slice(rows.start - wide.start, rows.stop - wide.start)
+
+
+def tile_means(height: int, pixels: Pixels, side: int = TILE) -> Tensor:
+    """Means (K, h, w) over tiles of the maps; tiles at the far border are smaller."""
+    means = [F.avg_pool2d(pixels(rows), side, ceil_mode=True, count_include_pad=False) for rows in bands(height)]
+    return torch.cat(means, 1)
+
+
+def average(means: Tensor, size: tuple[int, int], side: int = TILE) -> list[float]:
+    """Means of K maps over all pixels of an image of this size, from those over its tiles."""
+    count = torch.ones_like(means[0])
+    count[-1] *= 1 - (len(count) * side - size[0]) / side
+    count[:, -1] *= 1 - (count.shape[1] * side - size[1]) / side
+    weighted = (means * count).sum((1, 2)) / count.sum()
+    values: list[float] = weighted.tolist()
+    return values
+
+
+def enlarged_rows(means: Tensor, size: tuple[int, int], rows: slice) -> Tensor:
+    """Rows of what tile means (K, h, w) are bilinearly enlarged to, (K, rows, W)."""
+    last = means.shape[1] - 1
+    at = torch.arange(rows.start, rows.stop, dtype=means.dtype, device=means.device)
+    at = ((at + 0.5) * (means.shape[1] / size[0]) - 0.5).clamp(min=0)
+    above = at.long()
+    share = (at - above)[:, None]
+    lines = means[:, above] * (1 - share) + means[:, (above + 1).clamp(max=last)] * share
+    return F.interpolate(lines[None], size=(len(at), size[1]), mode="bilinear")[0]
+
+
+def enlarged(means: Tensor, size: tuple[int, int]) -> Tensor:
+    """The whole of it, (K, H, W) float32."""
+    image = torch.empty(means.shape[0], *size, device=means.device)
+    for rows in bands(size[0]):
+        image[:, rows] = enlarged_rows(means, size, rows).clamp(max=torch.finfo(image.dtype).max)
+    return image
