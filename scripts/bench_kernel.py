@@ -41,20 +41,27 @@ def best(function: Callable[[], None], repeat: int) -> float:
     return min(times)
 
 
-def make_guides(size: int) -> Guides:
+BUFFERS = {
+    "color": (),
+    "color, albedo, normal": ("albedo", "normal"),
+    "color, albedo, normal, visibility": ("albedo", "normal", "visibility"),
+}
+
+
+def make_guides(size: int, buffers: tuple[str, ...] = ("albedo", "normal", "visibility")) -> Guides:
     generator = torch.Generator().manual_seed(0)
 
     def buffer(channels: int) -> Tensor:
         return torch.rand(size, size, channels, generator=generator)
 
-    margin = WINDOW // 2
-    return Guides.of_half(buffer(3), buffer(3), margin=margin, albedo=buffer(3), normal=buffer(3), visibility=buffer(1))
+    features = {name: buffer(1 if name == "visibility" else 3) for name in buffers}
+    return Guides.of_half(buffer(3), buffer(3), margin=WINDOW // 2, **features)
 
 
-def nanoseconds(form: str, size: int, threads: int, repeat: int) -> float:
+def nanoseconds(form: str, size: int, threads: int, repeat: int, buffers: tuple[str, ...] | None = None) -> float:
     """Forward and backward of Eq. 10 and Eq. 8's half on one image of size² pixels."""
     torch.set_num_threads(threads)
-    guides = make_guides(size)
+    guides = make_guides(size) if buffers is None else make_guides(size, buffers)
     raw = 0.3 * torch.randn(1, heads_count(guides, "eq10"), size, size, generator=torch.Generator().manual_seed(1))
     raw = raw.to(memory_format=torch.channels_last).requires_grad_()
     corners = torch.zeros(1, 2, dtype=torch.int64)
@@ -135,6 +142,9 @@ def main() -> None:
         for isa in cpu.instruction_sets():
             value = nanoseconds(isa, PATCH, threads, options.repeat)
             print(f"  {isa:9} {value:6.2f}   {unfold / value:6.0f}x unfold  {shift / value:5.0f}x shift loop")
+    for name, buffers in BUFFERS.items():
+        value = nanoseconds(cpu.instruction_sets()[-1], PATCH, 1, options.repeat, buffers)
+        print(f"{cpu.instruction_sets()[-1]}, 1 thread, {name}: {value:.2f}")
     if not options.no_run:
         torch.set_num_threads(2)
         split_run(512)

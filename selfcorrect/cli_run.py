@@ -205,6 +205,8 @@ class Runner:
         for doubt in doubts(loaded.frame):
             log(f"warning: {doubt}")
         frame, denoiser = _denoised(self._options, loaded.frame, self._denoise, seconds)
+        for name in frame.constant:
+            log(f"{name}: the same at every pixel; not used")
         for name, repairs in frame.repairs.items():
             if any(repairs):
                 log(f"{name}: {repairs.non_finite} pixels were NaN or infinite, {repairs.negative} negative; repaired")

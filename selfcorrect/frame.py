@@ -45,7 +45,8 @@ class Frame:
     Every buffer is a pair of (H, W, C) float arrays, NumPy or torch; (H, W) will do for one channel. They become
     float32 tensors; G-buffers of half floats stay what they are, and take half the memory. A tensor that needs no
     change is not copied. Pixels that are NaN or infinite are filled from their finite neighbours, negative radiance
-    is clipped at 0 (as published), and both are counted in ``repairs``.
+    is clipped at 0 (as published), and both are counted in ``repairs``. A G-buffer that is the same at every pixel
+    says nothing and only costs time: it becomes None, and its name is in ``constant``.
 
     Args:
         color: noisy linear radiance, 3 channels, ≥ 0.
@@ -68,6 +69,7 @@ class Frame:
     depth: Pair | None = None
     denoised_full: Any = None
     repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
+    constant: list[str] = field(init=False, default_factory=list)
     _like: Any = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -99,8 +101,12 @@ class Frame:
             tensor, repairs = _repair(tensor, radiance=name in _RADIANCE)
             tensors.append(tensor)
             counts = Repairs(*(x + y for x, y in zip(counts, repairs, strict=True)))
-        object.__setattr__(self, name, tensors[0] if name == "denoised_full" else tuple(tensors))
         self.repairs[name] = counts
+        if name in _FEATURES and all(bool((tensor == tensor[0, 0]).all()) for tensor in tensors):
+            self.constant.append(name)
+            object.__setattr__(self, name, None)
+            return
+        object.__setattr__(self, name, tensors[0] if name == "denoised_full" else tuple(tensors))
 
     @property
     def size(self) -> tuple[int, int]:

@@ -137,3 +137,17 @@ def test_g_buffers_of_half_floats_are_kept_and_their_mean_is_not_rounded() -> No
     expected = (frame.albedo[0].double() + frame.albedo[1].double()) / 2
     assert torch.equal(mean(frame.albedo), expected.float())
     assert not torch.equal(expected.half().double(), expected)
+
+
+def test_a_buffer_that_says_nothing_is_left_out() -> None:
+    """The network has no input for it, the kernel no term."""
+    generator = torch.Generator().manual_seed(0)
+    color, other = (torch.rand(20, 30, 3, generator=generator) for _ in range(2))
+    normal = torch.rand(20, 30, 3, generator=generator)
+    flat = torch.full((20, 30, 3), 0.5)
+    frame = Frame((color, other), albedo=(flat, 2 * flat), normal=(normal, flat), depth=(flat[..., :1],) * 2)
+    assert frame.constant == ["albedo", "depth"]
+    assert frame.albedo is None
+    assert frame.depth is None
+    assert frame.normal is not None, "one half of it says something"
+    assert Frame((flat, flat)).color[0].shape == (20, 30, 3), "colour stays in any case"
