@@ -21,8 +21,9 @@ __all__ = ["Needs", "needs", "parse_size", "scratch_within"]
 
 GIB = 2**30
 _BASE = 0.35 * GIB  # the interpreter, torch, the OpenEXR library and OIDN's weights
-_WORK = 0.35 * GIB  # one strip of tiles in every form, and what the network keeps for one batch
-_LEAST_SCRATCH = 0.4 * GIB  # OIDN's smallest tile takes 0.34 GiB
+_WORK = 0.6 * GIB  # one strip of tiles in every form, the network's for one batch, and what the allocator keeps
+_OIDN = 0.2 * GIB  # its weights and buffers beside the scratch that it is told of
+_LEAST_SCRATCH = 0.4 * GIB  # its smallest tile takes 0.34 GiB
 _BYTES = {0: 4, 1: 2, 2: 4}  # uint, half, float
 _RGB = 12  # bytes of a pixel of three float32 channels
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
@@ -57,7 +58,7 @@ def scratch_within(limit: int, sources: Sources, settings: Settings) -> int:
         SettingsError: the frame does not fit.
     """
     found = needs(sources, settings)
-    needed = dict(found._asdict(), denoise=found.denoise + _LEAST_SCRATCH)
+    needed = dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
     stage = max(needed, key=lambda name: needed[name])
     if needed[stage] > limit:
         least = math.ceil(10 * needed[stage] / GIB) / 10
@@ -65,7 +66,7 @@ def scratch_within(limit: int, sources: Sources, settings: Settings) -> int:
             f"{sources.a}: expected --maxmem of at least {least:.1f}G for a frame of this size and these channels "
             f"(most of it to {stage}), but got {limit / GIB:.1f}G"
         )
-    return int(limit - found.denoise)
+    return int(limit - found.denoise - _OIDN)
 
 
 def needs(sources: Sources, settings: Settings) -> Needs:
@@ -87,7 +88,7 @@ def needs(sources: Sources, settings: Settings) -> Needs:
         read=_BASE + half + held + max(stored, half),
         denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image,
         correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence),
-        write=_BASE + 2 * image + held + max(stored, held),
+        write=_BASE + _WORK + 2 * image + held + max(stored, held),
     )
 
 

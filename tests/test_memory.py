@@ -89,7 +89,7 @@ def test_eight_k_fits_in_six_gibibytes(tmp_path: Path) -> None:
 
 def test_a_frame_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     frame, settings = sources(tmp_path), Settings.preset("balanced")
-    with pytest.raises(SettingsError, match=r"a.exr: expected --maxmem of at least 0\.8G .*, but got 0\.5G"):
+    with pytest.raises(SettingsError, match=r"a.exr: expected --maxmem of at least 1\.0G .*, but got 0\.5G"):
         scratch_within(parse_size("512M"), frame, settings)
     with pytest.raises(FileError, match="expected an OpenEXR file"):
         needs(Sources(str(tmp_path / "none.exr"), frame.b), settings)
