@@ -47,7 +47,7 @@ class Cost(NamedTuple):
 
     @property
     def correction(self) -> float:
-        """Seconds of training and inference."""
+        """Seconds of training, inference and guard."""
         return self.train + self.infer
 
 
@@ -165,7 +165,8 @@ def command(options: argparse.Namespace, folder: str, preset: str) -> Cost | Non
     if found is None:
         return None
     Path(f"{folder}/{preset}.exr").unlink()
-    denoise, train, infer = (found["seconds"][name] for name in ("denoise", "train", "infer"))
+    denoise, train, infer, guard = (found["seconds"].get(name, 0.0) for name in ("denoise", "train", "infer", "guard"))
+    infer += guard
     return Cost(denoise, train, infer, found["wall"] - denoise - train - infer, found["gibibytes"])
 
 
@@ -216,7 +217,7 @@ def sample(options: argparse.Namespace) -> dict[str, Any]:
         raise SelfcorrectError(f"expected --sample of at least 2, but got {options.sample}")
     each = (times[-1] - times[0]) / (len(times) - 1)
     train = result.seconds["train"] + each * (steps - len(times))
-    return {"train": train, "infer": result.seconds["infer"]}
+    return {"train": train, "infer": result.seconds["infer"] + result.seconds.get("guard", 0.0)}
 
 
 JOBS = {"frame": make_frame, "oidn": time_oidn, "sample": sample}

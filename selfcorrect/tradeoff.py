@@ -73,7 +73,7 @@ class Measurement:
         ratio: error over that of the denoised image; below 1 is better.
         standard_error: of ``ratio``.
         train: seconds of training, everything before inference included.
-        infer: seconds of inference and guard.
+        infer: seconds of inference, guard and other stages.
         started_warm: whether training went on from the frame before.
     """
 
@@ -194,7 +194,8 @@ def sweep(
         network = correct(previous, one.settings).network if one.warm and previous is not None else None
         result = correct(frame, one.settings, warm_start=network)
         ratio, error = judge(result)
-        yield Measurement(one, ratio, error, result.seconds["train"], result.seconds["infer"], result.start.warm)
+        train = result.seconds.get("train", 0.0)
+        yield Measurement(one, ratio, error, train, sum(result.seconds.values()) - train, result.start.warm)
 
 
 def warm_up(frame: Frame) -> None:
