@@ -11,6 +11,9 @@ box, since a wider one correlates the noise of neighbours, and a film that names
 in TEXT stands arithmetic over the frame number: ``{1.5 + sin(frame / 24)}``, ``wood.{frame:04d}.png``. A scene that
 uses ``$frame`` gets the frame number without being asked.
 
+``--crn`` gives every pixel the same random numbers, and ``--poisson`` an image reconstructed from the finite
+differences of such a render: what `selfcorrect combine` takes as correlated images.
+
 Needs the extra `render`; the LLVM variants also need the LLVM shared library (`apt-get install libllvm19`, and the
 variable DRJIT_LIBLLVM_PATH where it is not found), and without it `--variant scalar_rgb` does the same, more slowly.
 """
@@ -29,6 +32,7 @@ import mitsuba as mi
 import numpy as np
 from halves import HALVES, add_arguments, path_of, published, seed_of
 
+CRN = "common_random_numbers"  # the sampler of the script of this name
 AOVS = "albedo:albedo,nn:sh_normal,dd:depth"
 PATHS_PER_PASS = 2**23
 """More samples are rendered in several passes: the LLVM and CUDA variants hold all paths of one in memory."""
@@ -94,8 +98,10 @@ def definitions(texts: list[str], frame: int) -> dict[str, str]:
     return found
 
 
-def load_scene(path: Path, parameters: dict[str, str], size: tuple[int, int] | None = None) -> Any:
-    """The scene with a box filter and, where ``size`` is given, that width and height.
+def load_scene(
+    path: Path, parameters: dict[str, str], size: tuple[int, int] | None = None, sampler: str | None = None
+) -> Any:
+    """The scene with a box filter and, where they are given, that width and height, and that kind of sampler.
 
     Raises:
         RenderError: Mitsuba does not take the scene.
@@ -107,6 +113,8 @@ def load_scene(path: Path, parameters: dict[str, str], size: tuple[int, int] | N
         for node in state.nodes:
             if node.type == mi.ObjectType.Film:
                 _mend_film(state, node.props, size)
+            if sampler is not None and node.type == mi.ObjectType.Sampler:
+                node.props.set_plugin_name(sampler)
         scene = mi.parser.instantiate(config, state)
     except RuntimeError as error:
         raise RenderError(f"{path}: {' '.join(str(error).split())}") from None
@@ -163,6 +171,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("scene", type=Path, metavar="SCENE.xml")
     add_arguments(parser)
     parser.add_argument("-D", "--define", action="append", default=[], metavar="NAME=TEXT", help="'angle={2 * frame}'")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--crn", action="store_true", help="common random numbers: the same sequence in every pixel")
+    kind.add_argument("--poisson", action="store_true", help="screened Poisson of independent samples and of --crn's")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba (default: %(default)s)")
     return parser.parse_args()
 
@@ -174,14 +185,26 @@ def render_shot(options: argparse.Namespace) -> None:
     for frame in options.frames or [None]:
         number = 1 if frame is None else frame
         parameters = dict.fromkeys(own, str(number)) | definitions(options.define, number)
-        scene = load_scene(options.scene, parameters, options.size)
+        kinds = ["independent", CRN] if options.poisson else [CRN] if options.crn else [None]
+        scenes = [load_scene(options.scene, parameters, options.size, kind) for kind in kinds]
         for half in HALVES:
             started = time.perf_counter()
-            bitmap = render(scene, options.spp // 2, seed_of(options.seed, number, half))
+            seed = seed_of(options.seed, number, half)
+            bitmap, *common = (render(scene, options.spp // 2, seed) for scene in scenes)
+            if common:
+                _reconstruct(bitmap, common[0])
             path = path_of(options.output, name, half, frame)
             with published(path) as temporary:
                 bitmap.write(str(temporary))
             print(f"{path}: {options.spp // 2} spp, {time.perf_counter() - started:.1f} s", flush=True)
+
+
+def _reconstruct(bitmap: Any, common: Any) -> None:
+    """Put the screened-Poisson image in place of the colour of independent samples."""
+    from common_random_numbers import screened_poisson  # noqa: PLC0415  # it chooses the LLVM variant
+
+    values, differences = (np.array(image, copy=False) for image in (bitmap, common))
+    values[..., :3] = screened_poisson(values[..., :3], differences[..., :3])
 
 
 def main() -> int:
@@ -194,6 +217,10 @@ def main() -> int:
         return 2
     try:
         mi.set_variant(options.variant)
+        if options.crn or options.poisson:
+            if not options.variant.startswith("llvm"):
+                raise RenderError(f"expected an LLVM variant with common random numbers, but got {options.variant}")
+            import common_random_numbers  # noqa: F401, PLC0415  # registers the sampler in the variant just set
         render_shot(options)
     except ImportError as error:  # of the LLVM library
         print(f"render_mitsuba: error: {error}; or take --variant scalar_rgb", file=sys.stderr)

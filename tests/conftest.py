@@ -2,6 +2,7 @@
 
 import os
 import platform
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +19,12 @@ torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(mode=True)
 
 
+def has_llvm() -> bool:
+    """Whether Mitsuba finds an LLVM library that it can work with; no package installs one."""
+    probe = 'import mitsuba as mi; mi.set_variant("llvm_ad_rgb"); assert (mi.Float([1, 2]) + 1)[1] == 3'
+    return subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
+
+
 def shared_folder() -> Path:
     here = Path(__file__).resolve().parent.parent.parent / "shared"
     return Path(os.environ.get("SELFCORRECT_SHARED", here))
@@ -30,8 +37,9 @@ def shared() -> Path:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests of what this machine cannot have: the development frames, Blender; and no others."""
+    """Leave out the tests of what this machine cannot have: the development frames, Blender, LLVM; and no others."""
     there = {"shared": shared_folder().is_dir(), "blender": HAS_BLENDER}
+    there["llvm"] = any(item.get_closest_marker("llvm") for item in items) and has_llvm()
     if os.environ.get("SELFCORRECT_REQUIRE_SHARED") and not any(item.get_closest_marker("shared") for item in items):
         raise pytest.UsageError("expected tests that need the development frames, but got none")
     lacking = [item for item in items if any(item.get_closest_marker(need) and not there[need] for need in there)]

@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from selfcorrect import exr
+
 pytestmark = [
     pytest.mark.mitsuba,
+    pytest.mark.llvm,
     # drjit's own modules, on import
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
 ]
@@ -58,3 +61,38 @@ def test_errors_of_neighbours_correlate(renders: dict[str, np.ndarray]) -> None:
 def test_screened_poisson_is_better_than_what_it_is_made_from(renders: dict[str, np.ndarray]) -> None:
     error = {name: ((renders[name] - renders["reference"]) ** 2).mean() for name in ("independent", "poisson")}
     assert error["poisson"] < 0.8 * error["independent"]
+
+
+SCENE = """
+<scene version="3.0.0">
+  <integrator type="path"/>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="40"/></film>
+    <sampler type="independent"/>
+  </sensor>
+  <shape type="sphere"/>
+  <shape type="rectangle"><transform name="to_world"><scale value="3"/><translate z="-1"/></transform></shape>
+  <emitter type="constant"/>
+</scene>
+"""
+
+
+def neighbours_in(folder: Path) -> float:
+    """Correlation of the noise of horizontal neighbours in the two halves of a folder."""
+    a, b = (exr.load_half(str(path)).buffers["color"] for path in sorted(folder.glob("*.exr")))
+    noise = (a - b).mean(-1)
+    return float(np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1])
+
+
+def test_the_render_script_has_both_kinds(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE)
+    found = {}
+    for kind in ("--crn", "--poisson", "--variant=llvm_ad_rgb"):
+        command = [sys.executable, str(SCRIPTS / "render_mitsuba.py"), str(scene), "-o", str(tmp_path / kind), kind]
+        subprocess.run([*command, "--spp", "16"], check=True)
+        found[kind] = neighbours_in(tmp_path / kind)
+    assert found["--crn"] > 0.5
+    assert found["--poisson"] > 0.5
+    assert abs(found["--variant=llvm_ad_rgb"]) < 0.1

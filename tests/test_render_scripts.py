@@ -53,7 +53,7 @@ def assert_halves(folder: Path, name: str, frames: list[int], taken: dict[str, l
     assert sorted(folder.glob("*.exr")) + sorted(folder.glob(".*")) == sorted(itertools.chain(*pairs))
     for a, b in pairs:
         loaded = files.load(files.Sources(str(a), str(b)))
-        assert {role: names for role, names in loaded.taken.items()} == taken
+        assert {role: names for role, names in loaded.origin.taken.items()} == taken
         assert doubts(loaded.frame) == []
         assert loaded.frame.size[0] * loaded.frame.size[1] > 4096  # the fewest pixels that doubts() judges
         noise = color(a) - color(b)
