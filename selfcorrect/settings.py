@@ -155,7 +155,7 @@ class Settings:
         )
         return {
             "balanced": balanced,
-            "fast": replace(balanced, steps=100, warm_steps=50, learning_rate=3e-3, warm_learning_rate=1.5e-3),
+            "fast": replace(balanced, steps=50, warm_steps=17, learning_rate=5e-3, warm_learning_rate=2.5e-3),
             "best": replace(balanced, batch=16),
             "paper": cls(),
         }

@@ -19,7 +19,7 @@ __all__ = ["Adam", "Limits", "Progress", "starting_losses", "train"]
 
 Progress = Callable[[int, int, float], None]
 
-_WARM_UP = 20  # steps over which the cosine schedule reaches its rate
+_WARM_UP = 20  # steps over which the cosine schedule reaches its rate, but no more than a fifth of all
 _SHORTEST_ROUND = 0.5  # of the time that the steps took before: less is not worth beginning again for
 _LEAST_GAIN = 0.001  # of Eq. 8, most of which is noise that no network can take away
 _SAMPLE = 4  # rows and columns of patches that tell how well a network starts
@@ -134,7 +134,7 @@ def _round(
         loss = dual_buffer_loss(network(batch), corners, guides, weights, settings)
         loss.backward()
         if bool(loss.isfinite()):
-            optimiser.step(rate * _schedule(len(losses), done, settings))
+            optimiser.step(rate * _schedule(len(losses), steps, done, settings))
         losses.append(float(loss.detach()))
         if progress is not None:
             progress(len(losses), steps, losses[-1])
@@ -168,8 +168,8 @@ def _weights(guides: tuple[Guides, Guides], settings: Settings) -> tuple[Tensor,
     return (b, a) if settings.crossed_weights else (a, b)
 
 
-def _schedule(step: int, done: float, settings: Settings) -> float:
+def _schedule(step: int, steps: int, done: float, settings: Settings) -> float:
     """Factor of the rate: constant, or half a cosine over the part ``done`` of the way, after a linear warm-up."""
     if settings.schedule == "constant":
         return 1.0
-    return min(1.0, (step + 1) / _WARM_UP) * (1 + math.cos(math.pi * done)) / 2
+    return min(1.0, (step + 1) / min(_WARM_UP, max(steps // 5, 1))) * (1 + math.cos(math.pi * done)) / 2
