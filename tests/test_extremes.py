@@ -1,6 +1,6 @@
 """Numerical extremes of the default preset: finite and never negative out, and nothing worse than went in."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -459,17 +459,24 @@ def test_exposure_changes_nothing_else(factor: float, deviation: float) -> None:
 
 
 def assert_same_but_for(factor: float, frame: Frame, preset: Settings) -> None:
+    """The frame and its multiple, both as what float32 keeps of the multiple: little where that is denormal."""
+
     def times(image: Any) -> Any:
         return (image.double() * factor).float()
 
-    assert frame.denoised is not None
-    other = Frame(
-        color=(times(frame.color[0]), times(frame.color[1])),
-        denoised=(times(frame.denoised[0]), times(frame.denoised[1])),
-        denoised_full=times(frame.denoised_full),
-        albedo=frame.albedo,
-    )
-    expected, got = corrected(frame, preset), corrected(other, preset)
+    def kept(image: Any) -> Any:
+        return (times(image).double() / factor).float()
+
+    def through(change: Callable[[Any], Any]) -> Frame:
+        assert frame.denoised is not None
+        return Frame(
+            color=(change(frame.color[0]), change(frame.color[1])),
+            denoised=(change(frame.denoised[0]), change(frame.denoised[1])),
+            denoised_full=change(frame.denoised_full),
+            albedo=frame.albedo,
+        )
+
+    expected, got = corrected(through(kept), preset), corrected(through(times), preset)
     image = plain(expected.image)
     assert np.abs(plain(got.image) / factor - image).max() < EQUIVARIANCE * image.mean()
     torch.testing.assert_close(got.aovs["blend"], expected.aovs["blend"], rtol=0, atol=EQUIVARIANCE)
