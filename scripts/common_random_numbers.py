@@ -22,7 +22,7 @@ _SEED = 0x1234567  # any number will do
 ALPHA = 0.2  # weight of the values against the gradients, as in gradient-domain path tracing (Kettunen et al. 2015)
 
 
-class CommonRandomNumbers(mi.Sampler):  # type: ignore[misc]  # Mitsuba has no types
+class CommonRandomNumbers(mi.Sampler):
     """Sample k of every pixel draws the same numbers.
 
     ``PCG32(size, …)`` gives every lane a stream of its own, so its state and increment are gathered by sample index.

@@ -95,7 +95,7 @@ def correct(
             timed("train", begun)
             begun = time.perf_counter()
             last = position == len(settings.stage_names)
-            state = _inferred(state, core.network, settings, evidence if last else None)
+            state = _after_core(state, core.network, settings, evidence if last else None)
             timed("infer", begun)
         else:
             state = _STEPS[name](state, settings)
@@ -131,7 +131,7 @@ def _automatic_scale(frame: Frame) -> float:
     return 1 / root**2 if root > 0 else 1.0
 
 
-def _inferred(state: State, network: Network, settings: Settings, evidence: Evidence | None) -> State:
+def _after_core(state: State, network: Network, settings: Settings, evidence: Evidence | None) -> State:
     """The state after the core; where nothing but the guard comes after it, the halves go to its evidence alone."""
     if evidence is not None:
         return state._replace(full=inferred(state, network, settings, evidence.add))
@@ -150,6 +150,6 @@ def _guarded(first: State, image: Tensor, evidence: Evidence) -> tuple[Tensor, G
     full = Scaled(first.full, first.scale)
     guarded = guard(evidence, full, scaled(image, first.scale), scale=first.scale)
     if not guarded.estimate.improved:
-        return first.full, guarded
+        return image.copy_(first.full), guarded  # not the frame's own tensor: the caller may change the result
     kept = keep_light(guarded.image, full, first.scaled_color)
     return scaled(kept, 1 / first.scale).clamp_(min=0), guarded

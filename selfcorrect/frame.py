@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 import torch
@@ -36,6 +36,12 @@ class Half(NamedTuple):
     normal: Tensor | None
     visibility: Tensor | None
     depth: Tensor | None
+
+
+class _Dual(Protocol):
+    """A denoiser that takes both halves at once."""
+
+    def pair(self, color: Pair, **features: Pair | None) -> Pair: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +142,7 @@ class Frame:
         """
         if getattr(denoiser, "dual", False):
             features = {name: getattr(self, name) for name in ("albedo", "normal", "depth", "visibility")}
-            pair = denoiser.pair(self.color, **features)  # type: ignore[attr-defined]  # only a dual one has it
+            pair = cast(_Dual, denoiser).pair(self.color, **features)
             return self.with_denoised(pair, mean(pair) if full else None)
         inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
         denoised_full = None

@@ -111,7 +111,6 @@ def _network(traits: Traits, tensors: dict[str, Tensor]) -> Network:
     settings = Settings(filters=traits.filters, layers=traits.layers, log_radiance=traits.log_radiance)
     network = Network(inputs, heads, settings, torch.Generator())
     network.load_state_dict(tensors)
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # lacking in torch's stubs
     network.traits = traits
     return network
 

@@ -330,7 +330,7 @@ def test_compare_is_the_sum_of_its_parts() -> None:
     assert metrics.compare(x, a).psnr == metrics.psnr(x, a)
     assert all(type(value) is float for value in dataclasses.asdict(comparison).values())
     with pytest.raises(dataclasses.FrozenInstanceError):
-        comparison.flip = 0.0  # type: ignore[misc]  # that this is refused is the point
+        comparison.flip = 0.0  # that this is refused is the point
 
 
 def test_compare_with_itself_is_perfect() -> None:
