@@ -20,6 +20,7 @@ variable DRJIT_LIBLLVM_PATH where it is not found), and without it `--variant sc
 
 import argparse
 import ast
+import importlib
 import math
 import operator
 import re
@@ -31,8 +32,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from halves import HALVES, add_arguments, path_of, published, seed_of
+from screened_poisson import screened_poisson
 
-CRN = "common_random_numbers"  # the sampler of the script of this name
+CRN = "common_random_numbers"  # the sampler, and the script that has it
 AOVS = "albedo:albedo,nn:sh_normal,dd:depth"
 PATHS_PER_PASS = 2**23
 """More samples are rendered in several passes: the LLVM and CUDA variants hold all paths of one in memory."""
@@ -201,8 +203,6 @@ def render_shot(options: argparse.Namespace) -> None:
 
 def _reconstruct(bitmap: Any, common: Any) -> None:
     """Put the screened-Poisson image in place of the colour of independent samples."""
-    from common_random_numbers import screened_poisson  # noqa: PLC0415  # it chooses the LLVM variant
-
     values, differences = (np.array(image, copy=False) for image in (bitmap, common))
     values[..., :3] = screened_poisson(values[..., :3], differences[..., :3])
 
@@ -220,7 +220,7 @@ def main() -> int:
         if options.crn or options.poisson:
             if not options.variant.startswith("llvm"):
                 raise RenderError(f"expected an LLVM variant with common random numbers, but got {options.variant}")
-            import common_random_numbers  # noqa: F401, PLC0415  # registers the sampler in the variant just set
+            importlib.import_module(CRN)  # registers the sampler in the LLVM variant
         render_shot(options)
     except ImportError as error:  # of the LLVM library
         print(f"render_mitsuba: error: {error}; or take --variant scalar_rgb", file=sys.stderr)

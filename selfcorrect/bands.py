@@ -10,33 +10,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from selfcorrect.kernel import LARGEST
-
-__all__ = ["TILE", "Scaled", "average", "bands", "enlarged", "enlarged_rows", "scaled", "tile_means", "widened"]
+__all__ = ["TILE", "average", "bands", "enlarged", "enlarged_rows", "tile_means", "widened"]
 
 TILE = 16  # pixels; the side of tiles where none is given
 _BAND = 128  # rows; a multiple of every side
 
 Pixels = Callable[[slice], Tensor]
-
-
-class Scaled:
-    """An image (H, W, 3) of radiance times a factor, bounded like the guides; made where it is read, never whole."""
-
-    def __init__(self, image: Tensor, factor: float):
-        self.shape = image.shape
-        self._image, self._factor = image, factor
-
-    def __getitem__(self, rows: slice) -> Tensor:
-        return (self._image[rows].double() * self._factor).clamp(max=LARGEST).float()
-
-
-def scaled(image: Tensor, factor: float) -> Tensor:
-    """Radiance times a factor, in place; bounded by what float32 holds."""
-    largest = torch.finfo(torch.float32).max
-    for rows in bands(image.shape[0]):
-        image[rows] = (image[rows].double() * factor).clamp(-largest, largest)
-    return image
 
 
 def bands(height: int, rows: int | None = None) -> Iterator[slice]:

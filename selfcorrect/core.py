@@ -11,7 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from selfcorrect.bands import Scaled, bands, scaled
+from selfcorrect.bands import bands
+from selfcorrect.exposure import Scaled, scaled
 from selfcorrect.frame import Half, mean
 from selfcorrect.guard import trust_in_full
 from selfcorrect.infer import TILE, infer, infer_tile

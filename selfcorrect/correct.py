@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from selfcorrect.bands import Scaled, average, scaled, tile_means
+from selfcorrect.bands import average, tile_means
 from selfcorrect.core import Start, inferred, trained
 from selfcorrect.errors import FrameError
+from selfcorrect.exposure import Scaled, scaled
 from selfcorrect.frame import Frame, mean
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light
 from selfcorrect.network import Network

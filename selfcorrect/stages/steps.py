@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from selfcorrect.bands import Scaled, scaled
+from selfcorrect.exposure import Scaled, scaled
 from selfcorrect.frame import Half, mean
 from selfcorrect.settings import Settings
 from selfcorrect.stages import james_stein as js
