@@ -18,11 +18,12 @@ import argparse
 import time
 from pathlib import Path
 
+import power_laws
 import torch
 from bench_quality import load
 
 import denoisers
-from selfcorrect import Settings, correct, metrics, scaling, tradeoff
+from selfcorrect import Settings, correct, metrics, tradeoff
 
 
 def main() -> None:
@@ -80,7 +81,7 @@ def one_frame(options: argparse.Namespace, name: str, cost: float) -> list[str]:
         ratios = []
         for spp, before, (after, seconds) in zip(options.spp, denoised, results, strict=True):
             extra = seconds / cost
-            instead = scaling.interpolated(options.spp, denoised, spp + extra)
+            instead = power_laws.interpolated(options.spp, denoised, spp + extra)
             ratios.append(after / instead)
             beyond = " (beyond)" if spp + extra > options.spp[-1] else ""
             print(
@@ -93,7 +94,7 @@ def one_frame(options: argparse.Namespace, name: str, cost: float) -> list[str]:
 
 
 def verdict(spp: list[int], ratios: list[float]) -> str:
-    crossing = scaling.wins_from(spp, ratios)
+    crossing = power_laws.wins_from(spp, ratios)
     if crossing is None:
         return f"more samples win at {spp[-1]} spp"
     if max(ratios) < 1:

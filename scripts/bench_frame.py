@@ -26,10 +26,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import OpenEXR
+import power_laws
 import torch
 
 import denoisers
-from selfcorrect import Settings, correct, files, scaling
+from selfcorrect import Settings, correct, files
 from selfcorrect.errors import SelfcorrectError
 from selfcorrect.patches import steps_count
 
@@ -74,8 +75,8 @@ def main() -> None:
         seconds = [c.denoise if name == "OIDN" else c.correction for c in by_size.values()]
         memory = [c.gibibytes for c in by_size.values()]
         print(
-            f"{name}: seconds grow as pixels^{scaling.exponent(pixels, seconds):.2f}, "
-            f"peak memory as pixels^{scaling.exponent(pixels, memory):.2f}",
+            f"{name}: seconds grow as pixels^{power_laws.exponent(pixels, seconds):.2f}, "
+            f"peak memory as pixels^{power_laws.exponent(pixels, memory):.2f}",
             flush=True,
         )
 

@@ -15,6 +15,7 @@ from typing import Any
 import common_random_numbers as crn
 import numpy as np
 import torch
+from screened_poisson import screened_poisson
 
 from selfcorrect.stages.uncorrelated import KERNELS, combine
 
@@ -28,7 +29,7 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=8, help="of each of the eight renders")
     parser.add_argument("--reference", type=int, default=64, help="renders of 256 samples")
     options = parser.parse_args()
-    scenes = {common: crn.load_scene("cornell-box", common=common, size=options.size) for common in (False, True)}
+    scenes = {common: crn.cornell_box(common=common, size=options.size) for common in (False, True)}
     references = np.stack([crn.render(scenes[False], 256, 100_000 + i) for i in range(options.reference)])
     reference = references.mean(0)
     weight = 1 / (reference.mean(-1, keepdims=True) ** 2 + 0.01)
@@ -49,7 +50,7 @@ def combined(scenes: dict[bool, Any], spp: int, seed: int) -> dict[str, Image]:
     """What each kernel makes of four independent and four correlated renders, and of screened Poisson images."""
     y = [crn.render(scenes[False], spp, seed + i) for i in range(4)]
     z = [crn.render(scenes[True], spp, seed + 4 + i) for i in range(4)]
-    poisson = [crn.screened_poisson(own, common) for own, common in zip(y, z, strict=True)]
+    poisson = [screened_poisson(own, common) for own, common in zip(y, z, strict=True)]
     images = {"y": np.mean(y, 0), "z": np.mean(z, 0), "screened Poisson": np.mean(poisson, 0)}
     independent, correlated, made = (tuple(torch.from_numpy(i) for i in four) for four in (y, z, poisson))
     for kernel in KERNELS:

@@ -1,21 +1,15 @@
-"""Mitsuba renders whose pixels all see the same random numbers, and an image from their finite differences.
+"""A sampler for Mitsuba whose pixels all see the same random numbers; importing it registers it in `llvm_ad_rgb`.
 
-    python scripts/common_random_numbers.py SCENE.xml -o OUT.exr [--spp 16] [--seed 0] [--poisson] [--independent]
-
-With common random numbers the error of neighbouring pixels is nearly the same, so that their differences are known far
-better than their values. ``--poisson`` makes the image whose gradients are nearest to those differences and whose
-values are nearest to those of independent samples (L2 screened Poisson; both are rendered). ``cornell-box`` is the
-scene that comes with Mitsuba. Needs the extra ``render``.
+The error of neighbouring pixels is then nearly the same, so that their differences are known far better than their
+values. `scripts/render_mitsuba.py --crn` renders any scene with it; the Cornell box is here for tests and
+`scripts/bench_uncorrelated.py`. Needs the extra ``render``, and an LLVM library.
 """
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import drjit
 import mitsuba as mi
 import numpy as np
-from screened_poisson import screened_poisson
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -67,18 +61,11 @@ class CommonRandomNumbers(mi.Sampler):
 mi.register_sampler("common_random_numbers", CommonRandomNumbers)
 
 
-def load_scene(path: str, *, common: bool, size: int | None = None) -> Any:
-    """A scene with a box filter and the sampler wanted; ``cornell-box`` is built in.
-
-    The sampler's plug-in is chosen in the dictionary of the scene, so that only ``cornell-box`` and scenes that name
-    the parameter ``sampler`` (``<sampler type="$sampler">``) can be switched.
-    """
-    name = "common_random_numbers" if common else "independent"
-    if path != "cornell-box":
-        return mi.load_file(path, sampler=name)
+def cornell_box(*, common: bool, size: int) -> Any:
+    """Mitsuba's Cornell box of size² pixels, with a box filter and one of both samplers."""
     scene = mi.cornell_box()
-    film = scene["sensor"]["film"]
-    film.update(width=size or 256, height=size or 256, rfilter={"type": "box"})
+    scene["sensor"]["film"].update(width=size, height=size, rfilter={"type": "box"})
+    name = "common_random_numbers" if common else "independent"
     scene["sensor"]["sampler"] = {"type": name, "sample_count": 16}
     return mi.load_dict(scene)
 
@@ -86,25 +73,3 @@ def load_scene(path: str, *, common: bool, size: int | None = None) -> Any:
 def render(scene: Any, spp: int, seed: int) -> np.ndarray[Any, Any]:
     """Linear radiance, (H, W, 3) float32."""
     return np.array(mi.render(scene, spp=spp, seed=seed))[..., :3]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene")
-    parser.add_argument("-o", "--output", required=True, type=Path)
-    parser.add_argument("--spp", type=int, default=16)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--size", type=int, help="side of cornell-box, pixels")
-    kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--independent", action="store_true", help="independent samples instead")
-    kind.add_argument("--poisson", action="store_true", help="screened Poisson of both")
-    options = parser.parse_args()
-    scenes = {common: load_scene(options.scene, common=common, size=options.size) for common in (False, True)}
-    image = render(scenes[not options.independent], options.spp, options.seed)
-    if options.poisson:
-        image = screened_poisson(render(scenes[False], options.spp, options.seed), image)
-    mi.Bitmap(image).write(str(options.output))
-
-
-if __name__ == "__main__":
-    main()

@@ -22,8 +22,9 @@ RENDERS = """
 import sys
 import numpy as np
 import common_random_numbers as crn
+from screened_poisson import screened_poisson
 
-scenes = {c: crn.load_scene("cornell-box", common=c, size=48) for c in (False, True)}
+scenes = {c: crn.cornell_box(common=c, size=48) for c in (False, True)}
 reference = np.mean([crn.render(scenes[False], 256, 100 + i) for i in range(4)], 0)
 found = {"reference": reference}
 for common, name in ((False, "independent"), (True, "common")):
@@ -31,7 +32,7 @@ for common, name in ((False, "independent"), (True, "common")):
 again = crn.render(scenes[True], 16, 3)
 assert np.array_equal(again, found["common"][3])
 pairs = zip(found["independent"], found["common"])
-found["poisson"] = np.stack([crn.screened_poisson(y, z) for y, z in pairs])
+found["poisson"] = np.stack([screened_poisson(y, z) for y, z in pairs])
 np.savez(sys.argv[1], **found)
 """
 

@@ -9,13 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import power_laws
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from test_cli import BALANCED, run, write_half
 
-from selfcorrect import Frame, Result, Settings, cli, correct, scaling, tradeoff
+from selfcorrect import Frame, Result, Settings, cli, correct, tradeoff
 from selfcorrect.errors import FrameError, MissingPackageError, SettingsError
 from selfcorrect.tradeoff import Measurement, Point
 
@@ -281,15 +282,15 @@ class TestScaling:
     def test_a_power_law_is_found_again(self) -> None:
         x = np.array([16.0, 64.0, 256.0])
         y = 3 * x**-0.7
-        assert scaling.exponent(x.tolist(), y.tolist()) == pytest.approx(-0.7)
+        assert power_laws.exponent(x.tolist(), y.tolist()) == pytest.approx(-0.7)
         for at in (4.0, 16.0, 30.0, 64.0, 200.0, 1000.0):
-            assert scaling.interpolated(x.tolist(), y.tolist(), at) == pytest.approx(3 * at**-0.7)
+            assert power_laws.interpolated(x.tolist(), y.tolist(), at) == pytest.approx(3 * at**-0.7)
 
     def test_each_segment_has_its_own_slope(self) -> None:
         x, y = [1.0, 10.0, 100.0], [1.0, 0.1, 0.1]
-        assert scaling.interpolated(x, y, 10**0.5) == pytest.approx(10**-0.5)
-        assert scaling.interpolated(x, y, 50.0) == pytest.approx(0.1)
-        assert scaling.interpolated(x, y, 0.1) == pytest.approx(10)
+        assert power_laws.interpolated(x, y, 10**0.5) == pytest.approx(10**-0.5)
+        assert power_laws.interpolated(x, y, 50.0) == pytest.approx(0.1)
+        assert power_laws.interpolated(x, y, 0.1) == pytest.approx(10)
 
     @pytest.mark.parametrize(
         ("ratios", "expected"),
@@ -302,13 +303,13 @@ class TestScaling:
         ],
     )
     def test_winning_begins_where_it_stays(self, ratios: list[float], expected: float | None) -> None:
-        found = scaling.wins_from([16.0, 64.0, 256.0], ratios)
+        found = power_laws.wins_from([16.0, 64.0, 256.0], ratios)
         assert found == (expected if expected is None else pytest.approx(expected))
 
     def test_what_has_no_logarithm_is_refused(self) -> None:
         with pytest.raises(FrameError, match="above 0"):
-            scaling.interpolated([1.0, 2.0], [1.0, 0.0], 1.5)
+            power_laws.interpolated([1.0, 2.0], [1.0, 0.0], 1.5)
         with pytest.raises(FrameError, match="increasing"):
-            scaling.interpolated([2.0, 1.0], [1.0, 1.0], 1.5)
+            power_laws.interpolated([2.0, 1.0], [1.0, 1.0], 1.5)
         with pytest.raises(FrameError, match="two different"):
-            scaling.exponent([2.0, 2.0], [1.0, 1.0])
+            power_laws.exponent([2.0, 2.0], [1.0, 1.0])
