@@ -32,7 +32,7 @@ from selfcorrect.settings import STAGES
 from selfcorrect.stages import steps
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
 from selfcorrect.stages.regression import cross_buffer_regression
-from selfcorrect.stages.steps import State
+from selfcorrect.stages.steps import StageImages
 
 COMPOSITIONS = (
     *("core", "james-stein", "core,james-stein", "regression", "regression,james-stein"),
@@ -171,7 +171,7 @@ def work(stage: str, frame: Frame, threads: int) -> Callable[[], object]:
         return lambda: frame.denoise(denoisers.create(stage, threads=threads))
     name, _, stride = stage.partition(", stride ")
     settings = Settings.preset("balanced", **({"regression_stride": int(stride)} if stride else {}))
-    state = State(frame.halves, mean(frame.denoised))
+    state = StageImages(frame.halves, mean(frame.denoised))
     step = {"regression": steps.regress, "james-stein": steps.james_stein}[name]
     return lambda: step(state, settings)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from selfcorrect import cli_bench, cli_sequence, exr, files, memory, metrics
-from selfcorrect.cli_run import EndOnInterrupt, Runner, add_run_flags, answer, log, mapping, settings_of
+from selfcorrect.cli_run import EndOnInterrupt, Runner, add_halves, add_run_flags, answer, log, mapping, settings_of
 from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
@@ -47,12 +47,8 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     frame = commands.add_parser("frame", help="correct one frame")
-    frame.add_argument("a", metavar="A.exr", help="half a; FILE.exr::LAYER chooses a layer")
-    frame.add_argument("b", metavar="B.exr", help="half b, rendered with another seed")
+    add_halves(frame)
     frame.add_argument("-o", "--output", required=True, metavar="OUT.exr")
-    frame.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
-    frame.add_argument("--denoised-b", metavar="DB.exr")
-    frame.add_argument("--denoised", metavar="D.exr", help="denoised mean of both halves")
     frame.add_argument(
         "--maxmem",
         metavar="SIZE",

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from selfcorrect import exr, files, tradeoff
-from selfcorrect.cli_run import Runner, add_run_flags, answer, log, mapping
+from selfcorrect.cli_run import Runner, add_halves, add_run_flags, answer, log, mapping
 from selfcorrect.errors import SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import publish
@@ -22,11 +22,7 @@ _ERROR = "estimated relMSE over that of the denoised image"
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("bench", help="what each second buys on this frame, and the preset to take")
-    parser.add_argument("a", metavar="A.exr", help="half a; FILE.exr::LAYER chooses a layer")
-    parser.add_argument("b", metavar="B.exr", help="half b, rendered with another seed")
-    parser.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
-    parser.add_argument("--denoised-b", metavar="DB.exr")
-    parser.add_argument("--denoised", metavar="D.exr", help="denoised mean of both halves")
+    add_halves(parser)
     parser.add_argument(
         "--points",
         nargs="+",

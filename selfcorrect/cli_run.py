@@ -24,7 +24,17 @@ from selfcorrect.independence import doubts
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 
-__all__ = ["Corrected", "EndOnInterrupt", "Runner", "add_run_flags", "answer", "log", "mapping", "settings_of"]
+__all__ = [
+    "Corrected",
+    "EndOnInterrupt",
+    "Runner",
+    "add_halves",
+    "add_run_flags",
+    "answer",
+    "log",
+    "mapping",
+    "settings_of",
+]
 
 _WRITE_SECONDS = 5e-7  # a pixel
 
@@ -41,6 +51,15 @@ def answer(report: Mapping[str, Any]) -> None:
         print(json.dumps(report), flush=True)
 
 
+def add_halves(parser: argparse.ArgumentParser) -> None:
+    """A frame's two halves, and their denoised images where the user has them."""
+    parser.add_argument("a", metavar="A.exr", help="half a; FILE.exr::LAYER chooses a layer")
+    parser.add_argument("b", metavar="B.exr", help="half b, rendered with another seed")
+    parser.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
+    parser.add_argument("--denoised-b", metavar="DB.exr")
+    parser.add_argument("--denoised", metavar="D.exr", help="denoised mean of both halves")
+
+
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
     """The flags that every command with a correction takes; the settings' fields are among them."""
     parser.add_argument("--denoiser", metavar="NAME", help=f"one of {' | '.join(denoisers.names())}")
@@ -55,7 +74,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("settings, by default those of the preset")
     for f in fields(Settings):
         how: dict[str, Any] = {"type": type(f.default), "metavar": "|".join(f.metadata["choices"]) or "N"}
-        if f.name == "time_budget":
+        if f.metadata["unit"] == "s":
             how = {"type": _seconds, "metavar": "10s"}
         if isinstance(f.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
@@ -257,6 +276,7 @@ def _facts(frame: Frame, result: Result) -> dict[str, Any]:
     return {
         "size": {"width": frame.size[1], "height": frame.size[0]},
         "repairs": {name: repairs._asdict() for name, repairs in frame.repairs.items()},
+        "constant": frame.constant,
         "input_scale": result.input_scale,
         "steps": len(result.losses),
         "parameters": 0 if result.network is None else sum(p.numel() for p in result.network.parameters()),

@@ -20,7 +20,7 @@ from selfcorrect.kernel import Guides
 from selfcorrect.network import Network
 from selfcorrect.patches import crops, overhang
 from selfcorrect.settings import Settings
-from selfcorrect.stages.steps import State
+from selfcorrect.stages.steps import StageImages
 from selfcorrect.train import Limits, Progress, starting_losses, train
 
 __all__ = ["Start", "Trained", "inferred", "trained"]
@@ -54,7 +54,7 @@ class Trained(NamedTuple):
 
 
 def trained(
-    state: State,
+    state: StageImages,
     settings: Settings,
     *,
     warm_start: Network | None = None,
@@ -80,7 +80,7 @@ def trained(
     return Trained(network, start, losses)
 
 
-def inferred(state: State, network: Network, settings: Settings, keep: Keep) -> Tensor:
+def inferred(state: StageImages, network: Network, settings: Settings, keep: Keep) -> Tensor:
     """The corrected image, of each half with its own denoised image, and of both with the full one where that helps.
 
     ``keep`` is called with rows and what the network makes there of each half with its own image, of radiance times
@@ -104,7 +104,7 @@ def inferred(state: State, network: Network, settings: Settings, keep: Keep) -> 
     return scaled(image.clamp_(min=0), 1 / state.scale)
 
 
-def _training_guides(state: State, settings: Settings, generator: torch.Generator) -> tuple[Guides, Guides]:
+def _training_guides(state: StageImages, settings: Settings, generator: torch.Generator) -> tuple[Guides, Guides]:
     """What the network is trained on: both halves whole, or crops of them at the same places."""
     size = (state.full.shape[0], state.full.shape[1])
     margin = settings.window // 2
@@ -128,7 +128,7 @@ def _training_guides(state: State, settings: Settings, generator: torch.Generato
     return one(state.halves[0], state.images[0]), one(state.halves[1], state.images[1])
 
 
-def _seconds_after_training(network: Network, state: State, settings: Settings) -> float:
+def _seconds_after_training(network: Network, state: StageImages, settings: Settings) -> float:
     """How long inference and guard will take, by the time of a small tile."""
     height, width, _ = state.full.shape
     region = (0, 0, min(height, _TRIAL), min(width, _TRIAL))

@@ -17,7 +17,7 @@ from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 from selfcorrect.stages import steps
-from selfcorrect.stages.steps import State
+from selfcorrect.stages.steps import StageImages
 from selfcorrect.train import Progress
 
 __all__ = ["Result", "Start", "correct"]
@@ -82,7 +82,7 @@ def correct(
     if warm_start is not None and "core" not in settings.stage_names:
         raise FrameError(f"expected the stage core with a warm start, but got the stages {settings.stages}")
     given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
-    first = State(frame.halves, given, settings.input_scale or _automatic_scale(frame))
+    first = StageImages(frame.halves, given, settings.input_scale or _automatic_scale(frame))
     state, core, seconds = first, None, dict[str, float]()
 
     def timed(name: str, begun: float) -> None:
@@ -132,7 +132,7 @@ def _automatic_scale(frame: Frame) -> float:
     return 1 / root**2 if root > 0 else 1.0
 
 
-def _after_core(state: State, network: Network, settings: Settings, evidence: Evidence | None) -> State:
+def _after_core(state: StageImages, network: Network, settings: Settings, evidence: Evidence | None) -> StageImages:
     """The state after the core; where nothing but the guard comes after it, the halves go to its evidence alone."""
     if evidence is not None:
         return state._replace(full=inferred(state, network, settings, evidence.add))
@@ -146,7 +146,7 @@ def _after_core(state: State, network: Network, settings: Settings, evidence: Ev
     return state.then(images, full)
 
 
-def _guarded(first: State, image: Tensor, evidence: Evidence) -> tuple[Tensor, Guarded]:
+def _guarded(first: StageImages, image: Tensor, evidence: Evidence) -> tuple[Tensor, Guarded]:
     """What the stages made of the frame, guarded against what the denoiser had; ``image`` is used up."""
     full = Scaled(first.full, first.scale)
     guarded = guard(evidence, full, scaled(image, first.scale), scale=first.scale)

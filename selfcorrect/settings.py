@@ -14,9 +14,12 @@ _WARM = "not in the paper; scripts/bench_shot.py measures it"
 _STAGES = "not in the paper; scripts/bench_stages.py measures it"
 
 
-def _setting(default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0) -> Any:
-    """A field with what the command's help and the range check need."""
-    return field(default=default, metadata={"help": help_, "source": source, "choices": choices, "least": least})
+def _setting(
+    default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0, unit: str = ""
+) -> Any:
+    """A field with what the command's flag and the range check need."""
+    metadata = {"help": help_, "source": source, "choices": choices, "least": least, "unit": unit}
+    return field(default=default, metadata=metadata)
 
 
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
@@ -108,7 +111,7 @@ class Settings:
         False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
     time_budget: float = _setting(
-        0.0, "seconds for the whole frame: training takes what else needs not; 0 sets none", "the user's"
+        0.0, "seconds for the whole frame: training takes what else needs not; 0 sets none", "the user's", unit="s"
     )
     seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
 

@@ -13,7 +13,7 @@ from selfcorrect.frame import Half, mean
 from selfcorrect.guard import Guarded
 from selfcorrect.stages import steps
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
-from selfcorrect.stages.steps import State
+from selfcorrect.stages.steps import StageImages
 
 SMALL = {"patch": 16, "batch": 2, "steps": 2, "window": 5, "layers": 3, "regression_stride": 4}
 
@@ -105,7 +105,7 @@ def test_a_james_stein_half_knows_little_of_its_witness(heavy: bool) -> None:
         if heavy:
             errors = [0.2 * (torch.exp(1.5 * e) - 3.08) for e in errors]  # log-normal, mean 0
         halves = [Half(10 + e, torch.full(size, 9.5), None, None, None, None) for e in errors]
-        state = steps.james_stein(State((halves[0], halves[1]), torch.full(size, 9.5)), settings())
+        state = steps.james_stein(StageImages((halves[0], halves[1]), torch.full(size, 9.5)), settings())
         images = state.images
         for i in (0, 1):
             shares.append(float(((images[i] - 10) * errors[1 - i]).mean() / errors[1 - i].var()))

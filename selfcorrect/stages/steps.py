@@ -16,12 +16,12 @@ from selfcorrect.settings import Settings
 from selfcorrect.stages import james_stein as js
 from selfcorrect.stages import regression
 
-__all__ = ["State", "james_stein", "regress"]
+__all__ = ["StageImages", "james_stein", "regress"]
 
 _FEATURES = ("albedo", "normal", "visibility", "depth")
 
 
-class State(NamedTuple):
+class StageImages(NamedTuple):
     """What a step takes and gives.
 
     Attributes:
@@ -57,12 +57,12 @@ class State(NamedTuple):
         """The halves' images so far, times ``scale``, made where they are read."""
         return Scaled(self.images[0], self.scale), Scaled(self.images[1], self.scale)
 
-    def then(self, images: tuple[Tensor, Tensor], full: Tensor) -> "State":
+    def then(self, images: tuple[Tensor, Tensor], full: Tensor) -> "StageImages":
         """The state after a step that gave these images."""
         a, b = (half._replace(denoised=image) for half, image in zip(self.halves, images, strict=True))
-        return State((a, b), full, self.scale)
+        return StageImages((a, b), full, self.scale)
 
-    def scaled(self) -> "State":
+    def scaled(self) -> "StageImages":
         """The state with radiance times ``scale``, and bounded so that squares stay finite."""
 
         def one(half: Half, color: Scaled, image: Scaled) -> Half:
@@ -71,10 +71,10 @@ class State(NamedTuple):
             return half._replace(color=color[:], denoised=image[:], **features)
 
         a, b = (one(*each) for each in zip(self.halves, self.scaled_color, self.scaled_images, strict=True))
-        return State((a, b), Scaled(self.full, self.scale)[:])
+        return StageImages((a, b), Scaled(self.full, self.scale)[:])
 
 
-def regress(state: State, settings: Settings) -> State:
+def regress(state: StageImages, settings: Settings) -> StageImages:
     """Each half fitted by features of its own; the full image is the mean of the cross-buffer fits (Eqs. 10–12).
 
     A cross-buffer fit knows its witness through the other half's denoised image. The covariance with the witness's
@@ -87,7 +87,7 @@ def regress(state: State, settings: Settings) -> State:
     return state.then((a, b), scaled(mean(crossed), 1 / state.scale))
 
 
-def james_stein(state: State, settings: Settings) -> State:
+def james_stein(state: StageImages, settings: Settings) -> StageImages:
     """Each half and the full image shrunk from the noisy radiance towards what the steps so far have made (Eq. 13).
 
     Where a half's noise is large is told by both halves, (y^a − y^b)² / 2, but only as a mean over a block: see
