@@ -8,12 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.commands import write_half
 
 HAS_BLENDER = sys.version_info[:2] == (3, 11) and platform.machine() != "aarch64"
 """Where the package bpy has a wheel, the tests demand it."""
-
-BLENDER = Path(__file__).resolve().parent.parent / ".venv-blender" / "bin" / "python"
-"""The Python that has it; `sh scripts/setup-blender` makes it."""
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(mode=True)
@@ -28,6 +26,12 @@ def has_llvm() -> bool:
 def shared_folder() -> Path:
     here = Path(__file__).resolve().parent.parent.parent / "shared"
     return Path(os.environ.get("SELFCORRECT_SHARED", here))
+
+
+@pytest.fixture
+def halves(tmp_path: Path) -> tuple[Path, Path]:
+    """Two halves of one frame, in files."""
+    return write_half(tmp_path / "a.exr", 1), write_half(tmp_path / "b.exr", 2)
 
 
 @pytest.fixture(scope="session")

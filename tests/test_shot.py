@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_cli import write_half
+from helpers.commands import write_half
 
 from selfcorrect import Settings, cli, exr, files, shot
 from selfcorrect.network import Network
