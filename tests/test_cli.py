@@ -16,8 +16,6 @@ from helpers.onnx_models import NCHW, sum_of
 from selfcorrect import Settings, cli, exr
 
 PAPER = ["--preset", "paper"]
-
-
 FAST = [
     "--patch",
     "32",

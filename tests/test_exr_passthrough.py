@@ -114,8 +114,6 @@ def test_the_mark_of_linear_channels_passes_through(tmp_path):
 
 
 pack = struct.pack
-
-
 ATTRIBUTES = [
     ("aFloat", "float", pack("<f", 0.1)),
     ("aNegativeZero", "float", pack("<f", -0.0)),

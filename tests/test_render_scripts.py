@@ -102,8 +102,6 @@ MITSUBA_SCENE = """<scene version="3.0.0">
 <shape type="rectangle"><transform name="to_world"><scale value="20"/><rotate x="1" angle="-90"/>
   <translate y="-1"/></transform><bsdf type="diffuse"/></shape>
 </scene>"""
-
-
 MITSUBA_TAKEN = {"color": [*"RGB"], "albedo": three("albedo"), "normal": three("nn", "XYZ"), "depth": ["dd.T"]}
 SCALAR = ["--variant", "scalar_rgb"]
 
@@ -185,8 +183,6 @@ for layer in scene.view_layers:
     layer.use_pass_cryptomatte_object = layer.use_pass_z = layer.use_pass_normal = layer.use_pass_vector = True
 scene.render.film_transparent = scene.render.use_multiview = True
 """
-
-
 DRIVEN = "scene.driver_add('cycles.seed').driver.expression = '7'"
 KEYED = "scene.keyframe_insert('cycles.seed', frame=1)"
 

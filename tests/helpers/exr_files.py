@@ -80,8 +80,6 @@ def same_bits(first, second):
 
 
 MITSUBA = [*"RGB", *three("albedo"), *three("nn", "XYZ"), "dd.T"]
-
-
 CYCLES = [
     *three("ViewLayer.Combined", "RGBA"),
     *three("ViewLayer.Denoising Albedo"),
