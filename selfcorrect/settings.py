@@ -80,6 +80,11 @@ class Settings:
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
     epochs: int = _setting(20, "passes over all patches", f"{_PAPER}, Sec. 4", least=0)
     steps: int = _setting(0, "optimiser steps on patches drawn at random; 0 counts epochs", _OURS)
+    visits: int = _setting(
+        0,
+        "how often steps may see a pixel on average: fewer steps on small frames; 0 sets no bound",
+        "not in the paper; scripts/bench_small_frames.py measures it",
+    )
     warm_steps: int = _setting(0, "steps of a frame that starts warm, at most those of any frame; 0 takes those", _WARM)
     learning_rate: float = _setting(0.01, "Adam's rate", f"{_PAPER}, published code")
     warm_learning_rate: float = _setting(0.0, "rate of a frame that starts warm; 0 takes that of any frame", _WARM)
@@ -143,6 +148,7 @@ class Settings:
             batch=4,
             steps=400,
             warm_steps=133,
+            visits=64,
             learning_rate=1e-3,
             warm_learning_rate=5e-4,
             rate_from_variance=False,
@@ -159,7 +165,7 @@ class Settings:
         return {
             "balanced": balanced,
             "fast": replace(balanced, steps=50, warm_steps=17, learning_rate=5e-3, warm_learning_rate=2.5e-3),
-            "best": replace(balanced, batch=16),
+            "best": replace(balanced, batch=16, visits=128),
             "paper": cls(),
         }
 

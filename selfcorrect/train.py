@@ -12,7 +12,7 @@ from torch import Tensor
 from selfcorrect.kernel import Guides
 from selfcorrect.loss import dual_buffer_loss, learning_rate, relative_weight
 from selfcorrect.network import Network
-from selfcorrect.patches import batches, steps_count
+from selfcorrect.patches import batches, most_steps, steps_count
 from selfcorrect.settings import Settings
 
 __all__ = ["Adam", "Limits", "Progress", "starting_losses", "train"]
@@ -95,7 +95,8 @@ def train(
     limits = limits or Limits()
     end = time.perf_counter() + limits.seconds
     losses = _round(network, guides, settings, generator, progress, limits.stop, end)
-    while math.isfinite(end) and settings.steps and not limits.stop():
+    most = most_steps((guides[0].height, guides[0].width), settings)
+    while math.isfinite(end) and settings.steps and len(losses) < most and not limits.stop():
         left = end - time.perf_counter()
         if left < _SHORTEST_ROUND * (limits.seconds - left):
             break

@@ -1,10 +1,15 @@
-"""The optimiser against torch's own."""
+"""The optimiser against torch's own, and how long training lasts."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
+from bench_quality import load
 
+import denoisers
+from selfcorrect import Frame, Settings, correct, metrics
+from selfcorrect.patches import steps_count
 from selfcorrect.train import Adam
 
 
@@ -37,3 +42,34 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
     adam.step(0.1)
     assert parameter[0] < 1
     assert parameter.grad is None
+
+
+@pytest.mark.parametrize(
+    ("size", "changes", "steps"),
+    [
+        ((480, 270), {}, 400),
+        ((260, 260), {}, 264),
+        ((128, 128), {}, 64),
+        ((128, 128), {"batch": 16}, 16),
+        ((128, 128), {"visits": 0}, 400),
+        ((20, 20), {}, 1),
+        ((128, 128), {"steps": 5}, 5),
+    ],
+)
+def test_a_small_frame_takes_fewer_steps(size: tuple[int, int], changes: dict[str, int], steps: int) -> None:
+    assert steps_count(size, Settings.preset("balanced", **changes)) == steps
+
+
+@pytest.mark.shared
+def test_a_small_frame_is_not_learned_by_heart(shared: Path) -> None:
+    """A piece of which 400 steps made an image a sixth worse, and the guard believed it three times better."""
+    whole, references = load(shared / "frames", "classroom", 16)
+    piece = slice(71, 199), slice(176, 304)
+    roles = {role: getattr(whole, role) for role in ("color", "albedo", "normal", "depth")}
+    frame = Frame(**{role: tuple(image[piece].clone() for image in pair) for role, pair in roles.items()})
+    frame = frame.denoise(denoisers.create("oidn", threads=1))
+    result = correct(frame, Settings.preset("balanced"))
+    cut = [image[piece] for image in references]
+    assert metrics.relmse(result.image, *cut) <= 1.01 * metrics.relmse(frame.denoised_full, *cut)
+    assert result.estimate is not None
+    assert result.estimate.corrected > 0.8 * result.estimate.denoised
