@@ -66,7 +66,7 @@ class Denoiser(nn.Module):
         gain = 1 / level_of(color)
         if exposure is not None:
             gain = gain * exposure
-        scaled = (color * gain).clamp(0, _BRIGHTEST)
+        scaled = (color * gain).clamp(min=0).clamp(max=_BRIGHTEST)
         with torch.autocast("cpu", torch.bfloat16, enabled=torch.is_autocast_enabled("cpu")):
             logits = self._logits(torch.cat([torch.log1p(scaled), albedo, normal], dim=1))
         with torch.autocast("cpu", enabled=False):
@@ -89,7 +89,7 @@ class Denoiser(nn.Module):
     def _filtered(self, radiance: Tensor, albedo: Tensor, logits: list[Tensor]) -> Tensor:
         weight = torch.sigmoid(logits[0][:, TAPS + 1 : TAPS + 2].clamp(-_LOGIT, _LOGIT))
         share = torch.sigmoid(logits[0][:, TAPS + 2 :])
-        texture = 1 + share * (albedo.clamp(_DIMMEST_ALBEDO, 1) - 1)
+        texture = 1 + share * (albedo.clamp(_DIMMEST_ALBEDO, 1.0) - 1)
         pyramid = [torch.cat([radiance / texture * weight, weight], dim=1)]
         for _ in logits[1:]:
             pyramid.append(F.avg_pool2d(pyramid[-1], 2))
@@ -131,15 +131,15 @@ def _kernel(image: Tensor, logits: Tensor) -> Tensor:
 
 
 def filtered_reference(image: Tensor, kernel: Tensor) -> Tensor:
-    """Σ_j k_j · image shifted by tap j: (N, C, H, W) with (N, taps, H, W), zeros beyond the border."""
-    height, width = image.shape[-2:]
-    side = math.isqrt(kernel.shape[1])
-    padded = F.pad(image, (side // 2,) * 4)
-    total = torch.zeros_like(image)
-    for j in range(side**2):
-        y, x = divmod(j, side)
-        total = total + kernel[:, j : j + 1] * padded[:, :, y : y + height, x : x + width]
-    return total
+    """Σ_j k_j · image shifted by tap j: (N, C, H, W) with (N, taps, H, W), zeros beyond the border.
+
+    A convolution with a unit for each tap gathers the window of one channel: few operations for the ONNX graph.
+    """
+    taps = kernel.shape[1]
+    side = math.isqrt(taps)
+    units = torch.eye(taps, dtype=image.dtype).view(taps, 1, side, side)
+    planes = [F.conv2d(image[:, c : c + 1], units, padding=side // 2) for c in range(image.shape[1])]
+    return torch.cat([(plane * kernel).sum(1, keepdim=True) for plane in planes], dim=1)
 
 
 class _Filtered(torch.autograd.Function):
