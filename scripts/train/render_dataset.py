@@ -46,9 +46,10 @@ SIZE = 128
 SPP = (8, 16, 24, 32, 48, 64, 96, 128)  # of a frame
 PASSES = (64, 8, 2)  # samples of a pass: each number is compiled once for every scene, for 10 s
 EXTRA = {"joint-bilateral": 0.35, "nlm": 0.35, "nfor": 0.2, CRN: 0.1}  # beside oidn, one of them
-ROOMS, VALIDATION_ROOMS = range(12), range(1000, 1002)
+ROOMS, VALIDATION_ROOMS = range(10), range(1000, 1002)
 STILL_LIFE = "still-life"
 VALIDATION_VIEWS = 2  # per scene
+_REAL = 0.55  # of the training views show a real scene
 _DEPTH = 12
 _LIT = 0.5  # of the pixels must see light at 2 samples, or another view is drawn
 _VALIDATION = 7_000_000  # the numbers of validation views begin here
@@ -73,15 +74,14 @@ class Loaded(NamedTuple):
     up: Any
 
 
-def scene_names(scenes: Path) -> list[str]:
-    """The scenes that training sees, by turns as often real as procedural."""
-    real = sorted(path.parent.name for path in scenes.glob("*/scene.xml"))
-    return real + [f"room-{number}" for number in ROOMS[: max(len(real), 1) * 2]]
+def real_scenes(scenes: Path) -> list[str]:
+    """The names of the scenes with a file."""
+    return sorted(path.parent.name for path in scenes.glob("*/scene.xml"))
 
 
 def validation_names(scenes: Path) -> list[str]:
-    """The scenes of the validation views."""
-    return [*scene_names(scenes)[: -len(ROOMS)], *(f"room-{number}" for number in VALIDATION_ROOMS), STILL_LIFE]
+    """The scenes of the validation views: the real ones, and procedural ones that training does not see."""
+    return [*real_scenes(scenes), *(f"room-{number}" for number in VALIDATION_ROOMS), STILL_LIFE]
 
 
 @cache
@@ -144,10 +144,8 @@ def _seed(rng: np.random.Generator) -> int:
 def training_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
     """The view of that number: its scene, camera, materials and lights drawn by it and the seed."""
     rng = np.random.default_rng((job.seed, number))
-    names = scene_names(job.scenes)
-    real = len(names) - len([name for name in names if name.startswith("room-")])
-    group = names[:real] if real and rng.random() < 0.55 else names[real:]
-    name = str(rng.choice(group))
+    real = real_scenes(job.scenes)
+    name = str(rng.choice(real)) if real and rng.random() < _REAL else f"room-{rng.choice(ROOMS)}"
     place, reserved = _loaded(job.scenes, name, job.size), _reserved(job, name)
     while True:
         place.variation.draw(rng)
@@ -187,7 +185,12 @@ def _view(
         denoised["crn"] = inputs_of(torch.cat([common, common[:1]]))
     else:
         denoised[extra] = _denoised(extra, noisy, albedo, normal, depth)
-    facts = {"seed": str(job.seed), "number": str(number), "camera": repr(camera), "renderer": f"Mitsuba {mi.__version__}"}
+    facts = {
+        "seed": str(job.seed),
+        "number": str(number),
+        "camera": repr(camera),
+        "renderer": f"Mitsuba {mi.__version__}",
+    }
     return View(f"{number:07d}", scene, spp, color, albedo, normal, depth, denoised), facts
 
 

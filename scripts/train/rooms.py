@@ -109,7 +109,9 @@ def _walls(across: float, along: float, high: float, rng: Rng) -> Dict:
     for number, (first, last, bottom, up) in enumerate(strips):
         sides[f"left_{number}"] = box((-x - 0.2, first, bottom), (-x, last, up), left)
     for number, bar in enumerate(np.linspace(near, far, int(rng.integers(2, 9)))):
-        sides[f"bar_{number}"] = box((-x - 0.15, bar - 0.02, low), (-x - 0.1, bar + 0.02, top), matt(rgb(0.3, 0.3, 0.3)))
+        sides[f"bar_{number}"] = box(
+            (-x - 0.15, bar - 0.02, low), (-x - 0.1, bar + 0.02, top), matt(rgb(0.3, 0.3, 0.3))
+        )
     sun = rng.normal(0, 0.3, 3) + (1.0, 0.0, -0.6)
     sides["sun"] = {"type": "directional", "direction": [float(v) for v in sun],
                     "irradiance": rgb(*(rng.uniform(2, 30) * np.array([1.0, 0.9, 0.75])))}  # fmt: skip
@@ -150,12 +152,17 @@ def _things(across: float, along: float, high: float, rng: Rng) -> Dict:
                 ball = mi.ScalarTransform4f().translate([x, y, z + width]).rotate([0, 0, 1], float(rng.uniform(0, 360)))
                 things[name] = {"type": "sphere", "to_world": ball.scale(width / 2), "bsdf": _material(rng, solid=True)}
             case 1 | 2:
-                turn = mi.ScalarTransform4f().translate([x, y, z + width / 2]).rotate([0, 0, 1], float(rng.uniform(0, 90)))
+                turn = (
+                    mi.ScalarTransform4f().translate([x, y, z + width / 2]).rotate([0, 0, 1], float(rng.uniform(0, 90)))
+                )
                 shape = [float(v) for v in width * rng.uniform(0.2, 1.2, 3)]
                 things[name] = {"type": "cube", "to_world": turn.scale(shape), "bsdf": _material(rng)}
             case 3:
                 heights = np.linspace(0, 2 * width, 8)
-                profile = [(0.01, 0.0), *((float(r), float(h)) for r, h in zip(width * rng.uniform(0.1, 0.8, 8), heights, strict=True))]
+                profile = [
+                    (0.01, 0.0),
+                    *((float(r), float(h)) for r, h in zip(width * rng.uniform(0.1, 0.8, 8), heights, strict=True)),
+                ]
                 things[name] = lathe(name, profile, (x, y, z), _material(rng, solid=True))
             case _:
                 u, v = np.meshgrid(*2 * [np.linspace(-1, 1, 40)])
