@@ -14,10 +14,11 @@ from selfcorrect.stages.layers import convolution, start_flat, tau
 from selfcorrect.stages.taps import windowed_sum
 from selfcorrect.windows import reflected
 
-__all__ = ["DeepCombiner", "combined"]
+__all__ = ["DeepCombiner", "combined", "feature_planes"]
 
 _FEATURES = 7  # normal, albedo, depth
 _LEAST_SUM = 1e-10  # as published
+_BEYOND = 1e9  # depth from here on is a renderer's word for nothing hit (Blender's is 1e10)
 
 
 class DeepCombiner(nn.Module):
@@ -45,6 +46,14 @@ class DeepCombiner(nn.Module):
     ):
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
+        self.architecture = {
+            "buffers": buffers,
+            "width": width,
+            "window": window,
+            "layers": layers,
+            "kernel": kernel,
+        }
+        """The arguments that rebuild it."""
         self.pairs, self.window = buffers, window
         self.reach = layers * (kernel // 2)
         """Pixels that a weight sees on each side."""
@@ -90,3 +99,26 @@ def combined(weights: Tensor, residual: Tensor, denoised: Tensor, window: int) -
         moved = moved + taken + weight * (denoised[:, b] - base)
         total = total + weight
     return base + moved / total.clamp(min=_LEAST_SUM)
+
+
+def feature_planes(
+    size: tuple[int, int], *, normal: Tensor | None, albedo: Tensor | None, depth: Tensor | None
+) -> Tensor:
+    """What the combiner is shown of the G-buffers, (7, H, W) float32; zeros for those that are None.
+
+    Args:
+        size: (H, W).
+        normal: (H, W, 3), of unit length, in world space.
+        albedo: (H, W, 3), 0 … 1.
+        depth: (H, W, 1), ≥ 0, any unit: it is divided by its largest value in the image. Where nothing was hit, it
+            is 0, or 1e9 and more.
+    """
+    if depth is not None:
+        depth = torch.where(depth.float() < _BEYOND, depth.float(), 0.0).clamp(min=0)
+        depth = depth / depth.amax().clamp(min=torch.finfo(torch.float32).tiny)
+    planes = torch.zeros(_FEATURES, *size)
+    for first, buffer in ((0, normal), (3, albedo), (6, depth)):
+        if buffer is not None:
+            planes = planes.to(buffer.device)
+            planes[first : first + buffer.shape[2]] = buffer.permute(2, 0, 1)
+    return planes

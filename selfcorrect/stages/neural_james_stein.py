@@ -45,6 +45,8 @@ class VarianceNetwork(nn.Module):
 
     def __init__(self, seed: int = 0):
         super().__init__()
+        self.architecture: dict[str, int] = {}
+        """The arguments that rebuild it: its size is as published."""
         generator = torch.Generator().manual_seed(seed)
 
         def pair(inputs: int, outputs: int) -> nn.ModuleList:
