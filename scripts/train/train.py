@@ -35,7 +35,7 @@ from torch import nn
 from selfcorrect import metrics
 
 mpl.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402  (the backend comes first)
+import matplotlib.pyplot as plt
 
 WARM_UP = 0.02  # of the budget
 EMA = 0.999
