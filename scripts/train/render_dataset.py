@@ -26,10 +26,10 @@ from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import drjit  # noqa: E402  (after the path to the other scripts)
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
+import drjit
+import mitsuba as mi
+import numpy as np
+import torch
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -63,6 +63,16 @@ class Job(NamedTuple):
     seed: int
     reference_spp: int
     size: int
+
+
+class Shot(NamedTuple):
+    """What a view shows, and how it is rendered."""
+
+    number: int
+    scene: str
+    camera: Camera
+    spp: int
+    denoiser: str  # beside oidn
 
 
 class Loaded(NamedTuple):
@@ -156,7 +166,7 @@ def training_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
             break
     spp = int(rng.choice(SPP))
     extra = str(rng.choice(list(EXTRA), p=list(EXTRA.values())))
-    return _view(job, place, camera, name, number, spp, extra, rng)
+    return _view(job, place, Shot(number, name, camera, spp, extra), rng)
 
 
 def _denoised(
@@ -171,27 +181,21 @@ def _denoised(
     return torch.stack([*images, (images[4] + images[5]) / 2])
 
 
-def _view(
-    job: Job, place: Loaded, camera: Camera, scene: str, number: int, spp: int, extra: str, rng: np.random.Generator
-) -> tuple[View, dict[str, str]]:
-    images = torch.stack([rendered(place, job.size, spp // 4, _seed(rng)) for _ in range(5)])
+def _view(job: Job, place: Loaded, shot: Shot, rng: np.random.Generator) -> tuple[View, dict[str, str]]:
+    images = torch.stack([rendered(place, job.size, shot.spp // 4, _seed(rng)) for _ in range(5)])
     color, buffers = images[..., :3].contiguous(), images[:4, ..., 3:].mean(0)
     albedo, normal, depth = (buffers[..., part].contiguous() for part in (slice(3), slice(3, 6), 6))
     noisy = inputs_of(color)
     denoised = {"oidn": _denoised("oidn", noisy, albedo, normal, depth)}
-    if extra == CRN:
-        Variation.place(_sensor(job.size, CRN), camera, place.up)
-        common = torch.stack([rendered(place, job.size, spp // 4, _seed(rng), CRN) for _ in range(4)])[..., :3]
+    if shot.denoiser == CRN:
+        Variation.place(_sensor(job.size, CRN), shot.camera, place.up)
+        common = torch.stack([rendered(place, job.size, shot.spp // 4, _seed(rng), CRN) for _ in range(4)])[..., :3]
         denoised["crn"] = inputs_of(torch.cat([common, common[:1]]))
     else:
-        denoised[extra] = _denoised(extra, noisy, albedo, normal, depth)
-    facts = {
-        "seed": str(job.seed),
-        "number": str(number),
-        "camera": repr(camera),
-        "renderer": f"Mitsuba {mi.__version__}",
-    }
-    return View(f"{number:07d}", scene, spp, color, albedo, normal, depth, denoised), facts
+        denoised[shot.denoiser] = _denoised(shot.denoiser, noisy, albedo, normal, depth)
+    view = View(f"{shot.number:07d}", shot.scene, shot.spp, color, albedo, normal, depth, denoised)
+    facts = {"seed": job.seed, "number": shot.number, "camera": shot.camera, "renderer": f"Mitsuba {mi.__version__}"}
+    return view, {name: str(value) for name, value in facts.items()}
 
 
 def validation_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
@@ -204,7 +208,7 @@ def validation_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
     place.variation.restore()
     Variation.place(_sensor(job.size, "independent"), camera, place.up)
     spp = (16, 64)[which % 2]
-    view, facts = _view(job, place, camera, name, number, spp, "joint-bilateral", rng)
+    view, facts = _view(job, place, Shot(number, name, camera, spp, "joint-bilateral"), rng)
     pair = torch.stack([rendered(place, job.size, job.reference_spp, _seed(rng)) for _ in range(2)])[..., :3]
     smooth = _denoiser("oidn")(pair.mean(0), albedo=view.albedo, normal=view.normal)
     return view._replace(reference=pair.contiguous(), smooth=smooth), facts | {"reference_spp": str(job.reference_spp)}
@@ -238,8 +242,8 @@ def main() -> int:
     options = arguments()
     job = Job(options.scenes.resolve(), options.output, options.seed, options.reference_spp, options.size)
     all_validation = VALIDATION_VIEWS * len(validation_names(job.scenes))
-    wanted = {"validation": min(all_validation, options.validation if options.validation is not None else all_validation),
-              "train": options.views}  # fmt: skip
+    validation = all_validation if options.validation is None else min(all_validation, options.validation)
+    wanted = {"validation": validation, "train": options.views}
     todo = []
     for part, count in wanted.items():
         (job.output / part).mkdir(parents=True, exist_ok=True)
