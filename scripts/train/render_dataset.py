@@ -18,6 +18,7 @@ import os
 import sys
 import time
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
 from multiprocessing import get_context
@@ -51,7 +52,8 @@ STILL_LIFE = "still-life"
 VALIDATION_VIEWS = 2  # per scene
 _REAL = 0.55  # of the training views show a real scene
 _DEPTH = 12
-_LIT = 0.5  # of the pixels must see light at 2 samples, or another view is drawn
+_CANDIDATES = 3  # cameras for a view
+_LIT = 0.5  # of the pixels that see light at 2 samples; no more is asked
 _VALIDATION = 7_000_000  # the numbers of validation views begin here
 
 
@@ -147,6 +149,21 @@ def rendered(place: Loaded, size: int, spp: int, seed: int, sampler: str = "inde
     return torch.from_numpy(np.nan_to_num(np.asarray(total), posinf=0.0, neginf=0.0)).float()
 
 
+def _chosen_camera(job: Job, place: Loaded, reserved: Sequence[Camera], rng: np.random.Generator) -> Camera:
+    """Of a few random cameras with light before them, the one that sees the most edges: a plain wall teaches little."""
+    best, camera = -1.0, place.camera
+    for _ in range(_CANDIDATES):
+        candidate = random_camera(place.scene, place.camera, place.up, reserved, rng)
+        Variation.place(_sensor(job.size, "independent"), candidate, place.up)
+        pilot = rendered(place, job.size, 2, _seed(rng))
+        lit = float((pilot[..., :3].sum(-1) > 0).float().mean())
+        edges = min(1.0, 20 * float(pilot[..., 3:9].diff(dim=0).abs().mean()))
+        if min(lit / _LIT, 1.0) + edges > best:
+            best, camera = min(lit / _LIT, 1.0) + edges, candidate
+    Variation.place(_sensor(job.size, "independent"), camera, place.up)
+    return camera
+
+
 def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**31 - 1000))
 
@@ -157,13 +174,8 @@ def training_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
     real = real_scenes(job.scenes)
     name = str(rng.choice(real)) if real and rng.random() < _REAL else f"room-{rng.choice(ROOMS)}"
     place, reserved = _loaded(job.scenes, name, job.size), _reserved(job, name)
-    while True:
-        place.variation.draw(rng)
-        camera = random_camera(place.scene, place.camera, place.up, reserved, rng)
-        Variation.place(_sensor(job.size, "independent"), camera, place.up)
-        pilot = rendered(place, job.size, 2, _seed(rng))
-        if float((pilot[..., :3].sum(-1) > 0).float().mean()) > _LIT:
-            break
+    place.variation.draw(rng)
+    camera = _chosen_camera(job, place, reserved, rng)
     spp = int(rng.choice(SPP))
     extra = str(rng.choice(list(EXTRA), p=list(EXTRA.values())))
     return _view(job, place, Shot(number, name, camera, spp, extra), rng)
@@ -230,7 +242,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DATASET")
     parser.add_argument("--views", type=int, default=1000, help="of the training part (default: %(default)s)")
     parser.add_argument("--validation", type=int, help="validation views (default: two of each scene)")
-    parser.add_argument("--reference-spp", type=int, default=512, help="of each reference (default: %(default)s)")
+    parser.add_argument("--reference-spp", type=int, default=256, help="of each reference (default: %(default)s)")
     parser.add_argument("--size", type=int, default=SIZE, help="pixels (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes (default: one per core)")
