@@ -31,10 +31,9 @@ import mitsuba_oidn
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
+from scene import still_life
 
 mi.set_variant("llvm_ad_rgb")
-
-from scene import still_life  # noqa: E402  (Mitsuba's types exist only after set_variant)
 
 SHIPPED = Path(__file__).resolve().parent.parent / "selfcorrect" / "data"
 SIZE = 260  # just over 4 × 64: 25 patches of the paper's grid and two optimiser steps per epoch, where 256 has one

@@ -11,6 +11,8 @@ the shelves behind the camera. The lantern's bulb is small, so metal, glaze and 
 `mitsuba.set_variant` must have been called before `still_life`.
 """
 
+from __future__ import annotations  # Mitsuba's types exist only after set_variant
+
 from collections.abc import Callable
 from typing import Any
 

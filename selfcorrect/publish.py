@@ -10,6 +10,7 @@ import contextlib
 import os
 import re
 import secrets
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,10 +18,8 @@ from typing import BinaryIO
 
 from selfcorrect.errors import FileError
 
-try:
+if sys.platform != "win32":
     import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]  # every use asks first
 
 __all__ = ["publish", "remove_abandoned"]
 
@@ -40,9 +39,9 @@ def publish(target: Path, data: bytes | bytearray | memoryview) -> None:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
-            if fcntl is not None:
+            if sys.platform != "win32":
                 os.replace(temporary, target)  # while the lock is held: nobody takes it for abandoned
-        if fcntl is None:
+        if sys.platform == "win32":
             os.replace(temporary, target)  # an open file cannot be renamed on Windows
     except OSError as error:
         raise FileError(
@@ -85,7 +84,7 @@ def remove_abandoned(folder: Path) -> list[Path]:
 
 
 def _remove(path: Path) -> bool:
-    if fcntl is None:
+    if sys.platform == "win32":
         path.unlink()  # refused while it is open
         return True
     with open(path, "r+b") as stream:  # NFS locks only what is open for writing
@@ -97,10 +96,8 @@ def _remove(path: Path) -> bool:
 
 def _lock(stream: BinaryIO, *, wait: bool) -> bool:
     """Whether the file could be locked; no where another process holds the lock, or where there are no locks."""
-    if fcntl is None:
-        return False
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+    if sys.platform != "win32":
+        with contextlib.suppress(OSError):
+            fcntl.flock(stream, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+    return False

@@ -81,7 +81,8 @@ def load_state(path: str | Path) -> State:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata: dict[str, str] = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
+            names: list[str] = file.keys()
+            tensors = {name: file.get_tensor(name) for name in names}
     except OSError as error:
         raise FileError(f"{path}: expected a state of selfcorrect, but got: {error.strerror or error}") from None
     except safetensors.SafetensorError as error:

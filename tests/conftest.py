@@ -1,19 +1,23 @@
-"""What every test shares: the development frames, and fresh memory that is never zero by luck."""
+"""What the tests share: fixtures, the development frames, and fresh memory that is never zero by luck."""
 
+import json
 import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from helpers.commands import write_half
+from helpers.shots import Run, write_shot
+
+from selfcorrect import cli
 
 HAS_BLENDER = sys.version_info[:2] == (3, 11) and platform.machine() != "aarch64"
 """Where the package bpy has a wheel, the tests demand it."""
-
-BLENDER = Path(__file__).resolve().parent.parent / ".venv-blender" / "bin" / "python"
-"""The Python that has it; `sh scripts/setup-blender` makes it."""
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(mode=True)
@@ -28,6 +32,40 @@ def has_llvm() -> bool:
 def shared_folder() -> Path:
     here = Path(__file__).resolve().parent.parent.parent / "shared"
     return Path(os.environ.get("SELFCORRECT_SHARED", here))
+
+
+@pytest.fixture
+def halves(tmp_path: Path) -> tuple[Path, Path]:
+    """Two halves of one frame, in files."""
+    return write_half(tmp_path / "a.exr", 1), write_half(tmp_path / "b.exr", 2)
+
+
+@pytest.fixture
+def shot_folder(tmp_path: Path) -> Path:
+    """A folder that holds the halves of a short shot."""
+    return write_shot(tmp_path)
+
+
+@pytest.fixture
+def sequence(capfd: pytest.CaptureFixture[str]) -> Run:
+    """The command in this process: exit code, stderr, and the JSON objects of stdout."""
+
+    def one(given: list[str]) -> tuple[int, str, list[dict[str, Any]]]:
+        capfd.readouterr()
+        code = cli.main([*given, "--json"])
+        out, err = capfd.readouterr()
+        return code, err, [json.loads(line) for line in out.splitlines()]
+
+    return one
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """Torch on one thread; what it was before comes back."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

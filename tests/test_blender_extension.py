@@ -10,9 +10,8 @@ from typing import Any
 
 import build_blender_extension
 import pytest
-from conftest import BLENDER
-from test_cli import BALANCED
-from test_render_scripts import BLENDER_TAKEN, done
+from helpers.commands import BALANCED
+from helpers.render_scripts import BLENDER, BLENDER_TAKEN, done
 
 from selfcorrect import exr
 

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
-from test_denoisers_models import NCHW, sum_of
+from helpers.commands import BALANCED, refused, run, write_half
+from helpers.onnx_models import NCHW, sum_of
 
 from selfcorrect import Settings, cli, exr
 
-BALANCED = ["--steps", "4", "--patch", "16", "--batch", "2", "--window", "5", "--denoiser", "box", "--threads", "1"]
 PAPER = ["--preset", "paper"]
 FAST = [
     "--patch",
@@ -32,40 +31,6 @@ FAST = [
     "--threads",
     "1",
 ]
-
-
-def write_half(path: Path, seed: int, size: tuple[int, int] = (24, 30), **extra: Any) -> Path:
-    """A half as Mitsuba writes it, with alpha and an attribute to pass through."""
-    generator = np.random.default_rng(seed)
-    names = ["R", "G", "B", "A", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.T"]
-    channels = {name: generator.random(size, dtype=np.float32).astype(np.float16) for name in names} | extra
-    channels = {name: values for name, values in channels.items() if values is not None}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "owner": "a renderer"}
-    OpenEXR.File(header, channels).write(str(path))
-    return path
-
-
-@pytest.fixture
-def halves(tmp_path: Path) -> tuple[Path, Path]:
-    return write_half(tmp_path / "a.exr", 1), write_half(tmp_path / "b.exr", 2)
-
-
-def run(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """The installed command in a process of its own."""
-    command = [sys.executable, "-m", "selfcorrect", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, **options)
-
-
-def refused(*arguments: object, **options: Any) -> str:
-    """The one line that a refused run prints; exit code 2, nothing on stdout."""
-    result = run(*arguments, **options)
-    assert result.returncode == 2, result.stderr
-    assert result.stdout == ""
-    lines = [line for line in result.stderr.splitlines() if line.startswith("selfcorrect: error: ")]
-    assert len(lines) == 1, result.stderr
-    assert result.stderr.splitlines()[-1] == lines[0]
-    assert "Traceback" not in result.stderr
-    return lines[0]
 
 
 def test_frame_writes_a_corrected_image_and_passes_the_rest_through(halves: tuple[Path, Path], tmp_path: Path) -> None:

@@ -9,11 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from test_cli import halves, refused, run, write_half
+from helpers.commands import refused, run
 
 from selfcorrect import cli
-
-__all__ = ["halves", "write_half"]
 
 ENDLESS = [
     "--steps",

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.onnx_models import convolution
 from numpy.typing import NDArray
-from test_denoisers_models import convolution
 
 import denoisers
 from denoisers import Denoise

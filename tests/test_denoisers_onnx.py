@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from helpers.onnx_models import NCHW, NHWC, Shape, convolution, info, save, sum_of
 from onnx import TensorProto, helper
-from test_denoisers_models import NCHW, NHWC, Shape, convolution, info, save, sum_of
 
 import denoisers
 from denoisers.onnx import Onnx

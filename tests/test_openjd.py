@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import write_half
+from helpers.commands import write_half
 
 from selfcorrect import exr
 

@@ -4,43 +4,18 @@ import argparse
 import itertools
 import re
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import halves
 import numpy as np
 import pytest
-from conftest import BLENDER
-from test_exr import assert_passed_through, rewrite, three
+from helpers.exr_files import assert_passed_through, rewrite, three
+from helpers.render_scripts import BLENDER, BLENDER_TAKEN, done, refused
 
 from selfcorrect import exr, files, framerange
 from selfcorrect.errors import SettingsError
 from selfcorrect.independence import doubts
-
-SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
-
-
-def script(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    python = BLENDER if "blender" in name else sys.executable
-    command = [str(python), str(SCRIPTS / f"{name}.py"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-
-
-def done(name: str, *arguments: object) -> str:
-    result = script(name, *arguments)
-    assert result.returncode == 0, result.stderr + result.stdout
-    return result.stdout
-
-
-def refused(name: str, *arguments: object) -> str:
-    """The one line of an error that the user can mend."""
-    result = script(name, *arguments)
-    assert result.returncode == 2, result.stderr
-    lines = [line for line in result.stderr.splitlines() if f"{name}: error: " in line or f"{name}.py: error: " in line]
-    assert len(lines) == 1, result.stderr
-    assert "Traceback" not in result.stderr
-    return lines[0]
 
 
 def color(path: Path) -> Any:
@@ -201,12 +176,6 @@ def test_what_a_user_of_mitsuba_can_mend(scene: Path, tmp_path: Path, flags: lis
     assert list(tmp_path.iterdir()) == []
 
 
-BLENDER_TAKEN = {
-    "color": three("ViewLayer.Combined"),
-    "albedo": three("ViewLayer.Denoising Albedo"),
-    "normal": three("ViewLayer.Denoising Normal", "XYZ"),
-    "depth": ["ViewLayer.Denoising Depth.Z"],
-}
 LAYERS = """
 scene.view_layers[0].name = "Front"
 scene.view_layers.new("Back")

@@ -12,9 +12,9 @@ import numpy as np
 import power_laws
 import pytest
 import torch
+from helpers.commands import BALANCED, run, write_half
 from hypothesis import given
 from hypothesis import strategies as st
-from test_cli import BALANCED, run, write_half
 
 from selfcorrect import Frame, Result, Settings, cli, correct, tradeoff
 from selfcorrect.errors import FrameError, MissingPackageError, SettingsError
@@ -192,11 +192,6 @@ class TestTelling:
         assert cli.main(["bench", *halves, "--plot", str(picture), *BALANCED]) == 2
         assert "selfcorrect[bench]" in capsys.readouterr().err.splitlines()[-1]
         assert not picture.exists()
-
-
-@pytest.fixture
-def halves(tmp_path: Path) -> tuple[Path, Path]:
-    return write_half(tmp_path / "a.exr", 1), write_half(tmp_path / "b.exr", 2)
 
 
 class TestCommand:

@@ -18,6 +18,7 @@ import os
 import sys
 import time
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
 from multiprocessing import get_context
@@ -26,10 +27,10 @@ from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import drjit  # noqa: E402  (after the path to the other scripts)
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
+import drjit
+import mitsuba as mi
+import numpy as np
+import torch
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -51,7 +52,8 @@ STILL_LIFE = "still-life"
 VALIDATION_VIEWS = 2  # per scene
 _REAL = 0.55  # of the training views show a real scene
 _DEPTH = 12
-_LIT = 0.5  # of the pixels must see light at 2 samples, or another view is drawn
+_CANDIDATES = 3  # cameras for a view
+_LIT = 0.5  # of the pixels that see light at 2 samples; no more is asked
 _VALIDATION = 7_000_000  # the numbers of validation views begin here
 
 
@@ -63,6 +65,16 @@ class Job(NamedTuple):
     seed: int
     reference_spp: int
     size: int
+
+
+class Shot(NamedTuple):
+    """What a view shows, and how it is rendered."""
+
+    number: int
+    scene: str
+    camera: Camera
+    spp: int
+    denoiser: str  # beside oidn
 
 
 class Loaded(NamedTuple):
@@ -137,6 +149,21 @@ def rendered(place: Loaded, size: int, spp: int, seed: int, sampler: str = "inde
     return torch.from_numpy(np.nan_to_num(np.asarray(total), posinf=0.0, neginf=0.0)).float()
 
 
+def _chosen_camera(job: Job, place: Loaded, reserved: Sequence[Camera], rng: np.random.Generator) -> Camera:
+    """Of a few random cameras with light before them, the one that sees the most edges: a plain wall teaches little."""
+    best, camera = -1.0, place.camera
+    for _ in range(_CANDIDATES):
+        candidate = random_camera(place.scene, place.camera, place.up, reserved, rng)
+        Variation.place(_sensor(job.size, "independent"), candidate, place.up)
+        pilot = rendered(place, job.size, 2, _seed(rng))
+        lit = float((pilot[..., :3].sum(-1) > 0).float().mean())
+        edges = min(1.0, 20 * float(pilot[..., 3:9].diff(dim=0).abs().mean()))
+        if min(lit / _LIT, 1.0) + edges > best:
+            best, camera = min(lit / _LIT, 1.0) + edges, candidate
+    Variation.place(_sensor(job.size, "independent"), camera, place.up)
+    return camera
+
+
 def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**31 - 1000))
 
@@ -147,16 +174,11 @@ def training_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
     real = real_scenes(job.scenes)
     name = str(rng.choice(real)) if real and rng.random() < _REAL else f"room-{rng.choice(ROOMS)}"
     place, reserved = _loaded(job.scenes, name, job.size), _reserved(job, name)
-    while True:
-        place.variation.draw(rng)
-        camera = random_camera(place.scene, place.camera, place.up, reserved, rng)
-        Variation.place(_sensor(job.size, "independent"), camera, place.up)
-        pilot = rendered(place, job.size, 2, _seed(rng))
-        if float((pilot[..., :3].sum(-1) > 0).float().mean()) > _LIT:
-            break
+    place.variation.draw(rng)
+    camera = _chosen_camera(job, place, reserved, rng)
     spp = int(rng.choice(SPP))
     extra = str(rng.choice(list(EXTRA), p=list(EXTRA.values())))
-    return _view(job, place, camera, name, number, spp, extra, rng)
+    return _view(job, place, Shot(number, name, camera, spp, extra), rng)
 
 
 def _denoised(
@@ -171,27 +193,21 @@ def _denoised(
     return torch.stack([*images, (images[4] + images[5]) / 2])
 
 
-def _view(
-    job: Job, place: Loaded, camera: Camera, scene: str, number: int, spp: int, extra: str, rng: np.random.Generator
-) -> tuple[View, dict[str, str]]:
-    images = torch.stack([rendered(place, job.size, spp // 4, _seed(rng)) for _ in range(5)])
+def _view(job: Job, place: Loaded, shot: Shot, rng: np.random.Generator) -> tuple[View, dict[str, str]]:
+    images = torch.stack([rendered(place, job.size, shot.spp // 4, _seed(rng)) for _ in range(5)])
     color, buffers = images[..., :3].contiguous(), images[:4, ..., 3:].mean(0)
     albedo, normal, depth = (buffers[..., part].contiguous() for part in (slice(3), slice(3, 6), 6))
     noisy = inputs_of(color)
     denoised = {"oidn": _denoised("oidn", noisy, albedo, normal, depth)}
-    if extra == CRN:
-        Variation.place(_sensor(job.size, CRN), camera, place.up)
-        common = torch.stack([rendered(place, job.size, spp // 4, _seed(rng), CRN) for _ in range(4)])[..., :3]
+    if shot.denoiser == CRN:
+        Variation.place(_sensor(job.size, CRN), shot.camera, place.up)
+        common = torch.stack([rendered(place, job.size, shot.spp // 4, _seed(rng), CRN) for _ in range(4)])[..., :3]
         denoised["crn"] = inputs_of(torch.cat([common, common[:1]]))
     else:
-        denoised[extra] = _denoised(extra, noisy, albedo, normal, depth)
-    facts = {
-        "seed": str(job.seed),
-        "number": str(number),
-        "camera": repr(camera),
-        "renderer": f"Mitsuba {mi.__version__}",
-    }
-    return View(f"{number:07d}", scene, spp, color, albedo, normal, depth, denoised), facts
+        denoised[shot.denoiser] = _denoised(shot.denoiser, noisy, albedo, normal, depth)
+    view = View(f"{shot.number:07d}", shot.scene, shot.spp, color, albedo, normal, depth, denoised)
+    facts = {"seed": job.seed, "number": shot.number, "camera": shot.camera, "renderer": f"Mitsuba {mi.__version__}"}
+    return view, {name: str(value) for name, value in facts.items()}
 
 
 def validation_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
@@ -204,7 +220,7 @@ def validation_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
     place.variation.restore()
     Variation.place(_sensor(job.size, "independent"), camera, place.up)
     spp = (16, 64)[which % 2]
-    view, facts = _view(job, place, camera, name, number, spp, "joint-bilateral", rng)
+    view, facts = _view(job, place, Shot(number, name, camera, spp, "joint-bilateral"), rng)
     pair = torch.stack([rendered(place, job.size, job.reference_spp, _seed(rng)) for _ in range(2)])[..., :3]
     smooth = _denoiser("oidn")(pair.mean(0), albedo=view.albedo, normal=view.normal)
     return view._replace(reference=pair.contiguous(), smooth=smooth), facts | {"reference_spp": str(job.reference_spp)}
@@ -226,7 +242,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DATASET")
     parser.add_argument("--views", type=int, default=1000, help="of the training part (default: %(default)s)")
     parser.add_argument("--validation", type=int, help="validation views (default: two of each scene)")
-    parser.add_argument("--reference-spp", type=int, default=512, help="of each reference (default: %(default)s)")
+    parser.add_argument("--reference-spp", type=int, default=256, help="of each reference (default: %(default)s)")
     parser.add_argument("--size", type=int, default=SIZE, help="pixels (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes (default: one per core)")
@@ -238,8 +254,8 @@ def main() -> int:
     options = arguments()
     job = Job(options.scenes.resolve(), options.output, options.seed, options.reference_spp, options.size)
     all_validation = VALIDATION_VIEWS * len(validation_names(job.scenes))
-    wanted = {"validation": min(all_validation, options.validation if options.validation is not None else all_validation),
-              "train": options.views}  # fmt: skip
+    validation = all_validation if options.validation is None else min(all_validation, options.validation)
+    wanted = {"validation": validation, "train": options.views}
     todo = []
     for part, count in wanted.items():
         (job.output / part).mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 z points up. `mitsuba.set_variant` must have been called before this is imported.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -26,8 +27,8 @@ def room(seed: int, size: int = 128) -> Dict:
     scene |= _lamps(across, along, high, rng)
     scene |= _things(across, along, high, rng)
     eye = mi.ScalarTransform4f().look_at([0.0, -0.2 * along, 0.6 * high], [0.0, along, 0.5 * high], [0, 0, 1])
-    scene["sensor"] = {"type": "perspective", "fov": 60, "to_world": eye,
-                       "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}}  # fmt: skip
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    scene["sensor"] = {"type": "perspective", "fov": 60, "to_world": eye, "film": film}
     return scene
 
 
@@ -37,34 +38,36 @@ def _color(rng: Rng) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _pattern(rng: Rng) -> tuple[Any, Any]:
-    """A random colour texture and a height map, or None where it has none."""
-    match int(rng.integers(9)):
-        case 0:
-            return planks(rng, int(rng.integers(4, 12)), 512)
-        case 1:
-            return wallpaper(rng, 256)
-        case 2:
-            return books(rng, int(rng.integers(2, 6)), 512), None
-        case 3:
-            return print_page(rng), None
-        case 4:
-            return weave(rng, int(rng.integers(24, 96)), 384)
-        case 5:
-            return majolica(), None
-        case 6:
-            y, x = np.indices((512, 512)) * int(rng.integers(4, 24)) // 512
-            return blend(((x + y) % 2).astype(float), _color(rng), _color(rng)), None
+def _tiles(rng: Rng) -> tuple[Any, Any]:
+    y, x = np.indices((512, 512)) * int(rng.integers(4, 24)) // 512
+    return blend(((x + y) % 2).astype(float), _color(rng), _color(rng)), None
+
+
+def _clouds(rng: Rng) -> tuple[Any, Any]:
     field = cloud((512, 512), float(rng.uniform(0.3, 6)), float(rng.uniform(0.3, 1.8)), rng)
     mask = (field > rng.uniform(-1, 1)).astype(float) if rng.random() < 0.4 else 0.5 + 0.4 * field
     return blend(mask, _color(rng), _color(rng)), field
+
+
+# Each makes a colour texture and a height map, or None where it has none.
+_PATTERNS: tuple[Callable[[Rng], tuple[Any, Any]], ...] = (
+    lambda rng: planks(rng, int(rng.integers(4, 12)), 512),
+    lambda rng: wallpaper(rng, 256),
+    lambda rng: (books(rng, int(rng.integers(2, 6)), 512), None),
+    lambda rng: (print_page(rng), None),
+    lambda rng: weave(rng, int(rng.integers(24, 96)), 384),
+    lambda rng: (majolica(), None),
+    _tiles,
+    _clouds,
+    _clouds,
+)
 
 
 def _texture(rng: Rng, repeat: tuple[float, float]) -> tuple[Dict, Any]:
     """A colour, plain or patterned, and a height map for it."""
     if rng.random() < 0.3:
         return rgb(*_color(rng)), None
-    color, height = _pattern(rng)
+    color, height = _PATTERNS[rng.integers(len(_PATTERNS))](rng)
     return bitmap(np.clip(color, 0, 0.95), repeat), height
 
 
@@ -109,10 +112,9 @@ def _walls(across: float, along: float, high: float, rng: Rng) -> Dict:
     for number, (first, last, bottom, up) in enumerate(strips):
         sides[f"left_{number}"] = box((-x - 0.2, first, bottom), (-x, last, up), left)
     for number, bar in enumerate(np.linspace(near, far, int(rng.integers(2, 9)))):
-        sides[f"bar_{number}"] = box(
-            (-x - 0.15, bar - 0.02, low), (-x - 0.1, bar + 0.02, top), matt(rgb(0.3, 0.3, 0.3))
-        )
-    sun = rng.normal(0, 0.3, 3) + (1.0, 0.0, -0.6)
+        grey = matt(rgb(0.3, 0.3, 0.3))
+        sides[f"bar_{number}"] = box((-x - 0.15, bar - 0.02, low), (-x - 0.1, bar + 0.02, top), grey)
+    sun = rng.normal(0, 0.3, 3) + np.array([1.0, 0.0, -0.6])
     sides["sun"] = {"type": "directional", "direction": [float(v) for v in sun],
                     "irradiance": rgb(*(rng.uniform(2, 30) * np.array([1.0, 0.9, 0.75])))}  # fmt: skip
     sides["sky"] = {"type": "constant", "radiance": rgb(*(rng.uniform(0.5, 3) * np.array([0.7, 0.85, 1.0])))}

@@ -52,7 +52,7 @@ def near(first: Camera, second: Camera, size: float) -> bool:
 def random_camera(scene: Any, start: Camera, up: Vector, reserved: Sequence[Camera], rng: Rng) -> Camera:
     """A camera in the free space that is reached from ``start``, near none of ``reserved``.
 
-    Its field of view is that of 128 pixels across of a frame of 320 to 1280 pixels and 40 to 90 degrees.
+    Its field of view is that of 128 pixels across of a frame of 160 to 800 pixels and 40 to 90 degrees.
 
     Raises:
         RuntimeError: none was found.
@@ -74,7 +74,7 @@ def random_camera(scene: Any, start: Camera, up: Vector, reserved: Sequence[Came
         fine = np.flatnonzero((ahead > 2 * _NEAREST * size) & (ahead < _ROOM * size))
         if around.min() < _NEAREST * size or len(fine) == 0:
             continue
-        tangent = math.tan(math.radians(rng.uniform(40, 90)) / 2) * 128 / math.exp(rng.uniform(*np.log([320, 1280])))
+        tangent = math.tan(math.radians(rng.uniform(40, 90)) / 2) * 128 / math.exp(rng.uniform(*np.log([160, 800])))
         camera = Camera(_triple(origin), _triple(looks[rng.choice(fine)]), math.degrees(2 * math.atan(tangent)))
         if not any(near(camera, other, size) for other in reserved):
             return camera

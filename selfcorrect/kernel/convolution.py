@@ -1,6 +1,6 @@
 """The compiled convolutions as one differentiable torch function."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -98,7 +98,8 @@ def convolutions(
             expected = "the whole image (gradients are wanted)" if train else f"a region inside {whole}"
             raise FrameError(f"expected {expected}, but got the region {region}")
     views = [image if image.stride(2) == 1 else image.contiguous() for image in images]
-    result: Tensor = _Convolutions.apply(  # type: ignore[no-untyped-call]  # torch's
+    apply: Callable[..., Tensor] = _Convolutions.apply  # torch leaves it untyped
+    return apply(
         views,
         [top, left, bottom, right],
         train,
@@ -107,4 +108,3 @@ def convolutions(
         isa or best_instruction_set(precision),
         *parameters,
     )
-    return result

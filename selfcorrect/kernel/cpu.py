@@ -1,5 +1,6 @@
 """The compiled kernel as differentiable torch functions."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -90,8 +91,8 @@ def cross_bilateral(
 ) -> Tensor:
     """Eq. 10, like :func:`selfcorrect.kernel.reference.cross_bilateral`, for float32 on the CPU."""
     options = _Options(window, every, combination, isa, threads)
-    result: Tensor = _CrossBilateral.apply(raw, guides, corners, options)  # type: ignore[no-untyped-call]  # torch's
-    return result
+    apply: Callable[..., Tensor] = _CrossBilateral.apply  # torch leaves it untyped
+    return apply(raw, guides, corners, options)
 
 
 def cross_bilateral_loss(
@@ -109,7 +110,5 @@ def cross_bilateral_loss(
 ) -> Tensor:
     """One half of Eq. 8, value and gradient in one visit of each pixel."""
     options = _Options(window, every, combination, isa, threads)
-    result: Tensor = _CrossBilateralLoss.apply(  # type: ignore[no-untyped-call]  # torch's
-        raw, guides, corners, target, weight, options
-    )
-    return result
+    apply: Callable[..., Tensor] = _CrossBilateralLoss.apply  # torch leaves it untyped
+    return apply(raw, guides, corners, target, weight, options)
