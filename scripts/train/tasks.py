@@ -23,6 +23,8 @@ from selfcorrect.stages.regression import cross_buffer_regression
 __all__ = ["TASKS", "Judged", "Task", "task_of"]
 
 _REGRESSION_STRIDE = 4  # of the biased images in training: a view takes 0.1 s
+_PAIRS = (((0, 1), 4), ((2, 3), 5), (HALVES, WHOLE))
+"""Inputs of equal noise, and the number of their mean."""
 _BLURRED = 11  # pixels, side of the box that makes a bad biased image
 
 
@@ -139,8 +141,9 @@ class JamesSteinTask:
     darkens (at a relative noise of 1 by a third). So τ is taken as straight around the denoised inputs, which keeps
     what it is for, less weight on the brightest pixels, and costs no bias.
 
-    The biased images are regressions as the paper's (six times of ten), denoised images (three), and the inputs under a
-    box filter (one), which are bad ones: the network has to know those, too.
+    The biased images are what the stage may get: regressions as the paper's (four times of ten); the denoised inputs,
+    moved so that their mean is the denoised mean (three); one and the same denoised image twice, as where a half is
+    shrunk (two); and the inputs under a box filter (one): bad ones are to be known, too.
     """
 
     baseline = "classical James–Stein"
@@ -156,13 +159,16 @@ class JamesSteinTask:
     def sample(self, number: int, memory: Memory, generator: torch.Generator) -> Sample:
         """See :class:`Task`."""
         kind = float(torch.rand((), generator=generator))
-        if kind < 0.6:  # few of all possible pairs: each is kept, for it takes a while
+        if kind < 0.4:  # few of all possible pairs: each is kept, for it takes a while
             keys = HALVES if number % 2 else SINGLES[::2]
             biased = self._regression(number, memory, keys, "oidn" if number % 4 < 2 else _other(memory, number))
             return draw(memory, keys, "oidn", generator, crop=self.crop, biased=biased)
-        keys = HALVES if torch.rand((), generator=generator) < 0.5 else _drawn(SINGLES, 2, generator)
-        if kind < 0.9:
-            biased = memory.denoised[_denoiser(memory, generator)][list(keys)].float()
+        keys, whole = _PAIRS[int(torch.randint(len(_PAIRS), (), generator=generator))]
+        images = memory.denoised[_denoiser(memory, generator)].float()
+        if kind < 0.7:
+            biased = _moved(images, keys, whole)
+        elif kind < 0.9:
+            biased = images[[whole, whole]]
         else:
             biased = _blurred(memory.noisy(keys))
         return draw(memory, keys, "oidn", generator, crop=self.crop, biased=biased)
@@ -180,12 +186,13 @@ class JamesSteinTask:
         return torch.stack([tau_loss(t[None], target[None], level[None]) for t, target, level in each])
 
     def judge(self, network: nn.Module, view: View) -> list[Judged]:
-        """See :class:`Task`; with OIDN's regression, and a box filter, as biased images."""
+        """See :class:`Task`; with OIDN's images as the stage gets them, their regression, and a box filter."""
         memory = Memory.of(view)
         noisy = memory.noisy(HALVES)
         scale = 1 / level_of(view.denoised["oidn"][WHOLE].movedim(-1, 0))
         found = []
-        for biased in (_regressed(memory, HALVES, "oidn"), _blurred(noisy)):
+        denoised = _moved(memory.denoised["oidn"].float(), HALVES, WHOLE)
+        for biased in (denoised, _regressed(memory, HALVES, "oidn"), _blurred(noisy)):
             theta = _blend(network, noisy[None] * scale, biased[None] * scale) / scale
             x, y = ((image.mean(0) * scale).movedim(0, -1) for image in (noisy, biased))
             variance = variance_of_mean((_image(noisy[:1] * scale), _image(noisy[1:] * scale)))
@@ -215,6 +222,12 @@ def _regressed(memory: Memory, keys: tuple[int, ...], denoiser: str) -> Tensor:
     a, b = (half(*each) for each in zip(memory.noisy(keys), images, strict=True))
     fits = cross_buffer_regression((a, b), stride=_REGRESSION_STRIDE, threads=torch.get_num_threads())
     return torch.stack([fit.movedim(-1, 0) for fit in fits]) / scale
+
+
+def _moved(images: Tensor, keys: tuple[int, ...], whole: int) -> Tensor:
+    """Denoised inputs (2, 3, H, W) and what the denoised mean has beyond their mean, as in the stage."""
+    pair = images[list(keys)]
+    return pair + (images[whole] - pair.mean(0))
 
 
 def _blurred(images: Tensor) -> Tensor:
