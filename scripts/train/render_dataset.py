@@ -50,6 +50,8 @@ EXTRA = {"joint-bilateral": 0.35, "nlm": 0.35, "nfor": 0.2, CRN: 0.1}  # beside 
 ROOMS, VALIDATION_ROOMS = range(10), range(1000, 1002)
 STILL_LIFE = "still-life"
 VALIDATION_VIEWS = 2  # per scene
+VALIDATION = "validation"
+_BLOCK = 100  # views
 _REAL = 0.55  # of the training views show a real scene
 _DEPTH = 12
 _CANDIDATES = 3  # cameras for a view
@@ -168,11 +170,17 @@ def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**31 - 1000))
 
 
-def training_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
-    """The view of that number: its scene, camera, materials and lights drawn by it and the seed."""
-    rng = np.random.default_rng((job.seed, number))
-    real = real_scenes(job.scenes)
-    name = str(rng.choice(real)) if real and rng.random() < _REAL else f"room-{rng.choice(ROOMS)}"
+def scene_of(scenes: Path, seed: int, part: str, number: int) -> str:
+    """What a view shows; known before it is made, since a process takes one scene only."""
+    if part == VALIDATION:
+        return validation_names(scenes)[number // VALIDATION_VIEWS]
+    real, rng = real_scenes(scenes), np.random.default_rng((seed, number))
+    return str(rng.choice(real)) if real and rng.random() < _REAL else f"room-{rng.choice(ROOMS)}"
+
+
+def training_view(job: Job, name: str, number: int) -> tuple[View, dict[str, str]]:
+    """The view of that number: its camera, materials and lights drawn by it and the seed."""
+    rng = np.random.default_rng((job.seed, number, 1))
     place, reserved = _loaded(job.scenes, name, job.size), _reserved(job, name)
     place.variation.draw(rng)
     camera = _chosen_camera(job, place, reserved, rng)
@@ -210,10 +218,9 @@ def _view(job: Job, place: Loaded, shot: Shot, rng: np.random.Generator) -> tupl
     return view, {name: str(value) for name, value in facts.items()}
 
 
-def validation_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
+def validation_view(job: Job, name: str, number: int) -> tuple[View, dict[str, str]]:
     """A validation view: of a reserved camera, the scene as it is, with two references."""
-    names = validation_names(job.scenes)
-    name, which = names[number // VALIDATION_VIEWS], number % VALIDATION_VIEWS
+    which = number % VALIDATION_VIEWS
     rng = np.random.default_rng((job.seed, _VALIDATION, number))
     place = _loaded(job.scenes, name, job.size)
     camera = _reserved(job, name)[1 + which]
@@ -226,14 +233,28 @@ def validation_view(job: Job, number: int) -> tuple[View, dict[str, str]]:
     return view._replace(reference=pair.contiguous(), smooth=smooth), facts | {"reference_spp": str(job.reference_spp)}
 
 
-def _made(job: Job, part: str, number: int) -> tuple[str, str, int, float]:
-    """Make one view's file; runs in a worker."""
-    started = time.perf_counter()
+def _made(job: Job, part: str, name: str, numbers: list[int]) -> int:
+    """Make the files of some views of one scene; runs in a process of its own, and says how many."""
     torch.set_num_threads(1)
     drjit.set_thread_count(1)
-    view, facts = (training_view if part == "train" else validation_view)(job, number)
-    save(job.output / part / f"{view.name}.safetensors", view, facts)
-    return view.name, view.scene, view.spp, time.perf_counter() - started
+    for number in numbers:
+        started = time.perf_counter()
+        view, facts = (validation_view if part == VALIDATION else training_view)(job, name, number)
+        save(job.output / part / f"{view.name}.safetensors", view, facts)
+        seconds = time.perf_counter() - started
+        print(f"{part} {view.name} {view.scene} {view.spp} spp, {seconds:.1f} s", flush=True)
+    return len(numbers)
+
+
+def batches(scenes: Path, seed: int, part: str, numbers: list[int]) -> list[tuple[str, str, list[int]]]:
+    """The views in batches of one scene each: of every 100 views, those that show the same."""
+    found = []
+    for first in range(0, len(numbers), _BLOCK):
+        groups: dict[str, list[int]] = {}
+        for number in numbers[first : first + _BLOCK]:
+            groups.setdefault(scene_of(scenes, seed, part, number), []).append(number)
+        found += [(part, name, group) for name, group in groups.items()]
+    return found
 
 
 def arguments() -> argparse.Namespace:
@@ -255,16 +276,18 @@ def main() -> int:
     job = Job(options.scenes.resolve(), options.output, options.seed, options.reference_spp, options.size)
     all_validation = VALIDATION_VIEWS * len(validation_names(job.scenes))
     validation = all_validation if options.validation is None else min(all_validation, options.validation)
-    wanted = {"validation": validation, "train": options.views}
+    wanted = {VALIDATION: validation, "train": options.views}
     todo = []
     for part, count in wanted.items():
         (job.output / part).mkdir(parents=True, exist_ok=True)
         there = {int(metadata_of(path)["number"]) for path in views(job.output / part)}
-        todo += [(part, number) for number in range(count) if number not in there]
-    print(f"{len(todo)} of {sum(wanted.values())} views to render", flush=True)
+        missing = [number for number in range(count) if number not in there]
+        todo += batches(job.scenes, job.seed, part, missing)
+    print(f"{sum(len(numbers) for *_, numbers in todo)} of {sum(wanted.values())} views to render", flush=True)
     started, done = time.perf_counter(), 0
-    # Dr.Jit's threads don't survive a fork
-    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
+    # Spawned, since Dr.Jit's threads don't survive a fork; a new process for each batch, since Dr.Jit compiles into
+    # every kernel whatever a process has loaded.
+    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         waiting, queue = set(), iter(todo)
         while True:
             in_time = time.perf_counter() - started < 60 * options.minutes
@@ -274,10 +297,9 @@ def main() -> int:
                 break
             finished = next(as_completed(waiting))
             waiting.remove(finished)
-            name, scene, spp, seconds = finished.result()
-            done += 1
+            done += finished.result()
             hour = done / (time.perf_counter() - started) * 3600
-            print(f"{name} {scene} {spp} spp, {seconds:.1f} s, {hour:.0f} images an hour", flush=True)
+            print(f"{done} views, {hour:.0f} images an hour", flush=True)
     return 0
 
 
