@@ -33,7 +33,7 @@ from selfcorrect.stages import weights
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the other scripts
 
-from bench_quality import load as load_frame  # noqa: E402
+from bench_quality import load as load_frame
 
 DENOISERS = ("oidn", "joint-bilateral", "nfor", "onnx")
 STAGES = (

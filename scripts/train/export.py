@@ -84,6 +84,7 @@ def write_onnx(network: Denoiser, path: Path, facts: dict[str, Any]) -> None:
     model = program.model_proto
     metadata = {
         "multiple": str(MULTIPLE),
+        "optional": "albedo normal",
         "architecture": json.dumps(network.architecture),
         "settings": json.dumps(facts),
         "data": facts["data"],

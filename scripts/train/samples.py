@@ -19,6 +19,7 @@ MEMBERS = ((0,), (1,), (2,), (3,), (0, 1), (2, 3), (0, 1, 2, 3))
 SINGLES, HALVES, WHOLE = (0, 1, 2, 3), (4, 5), 6
 
 _RENDERS = 5
+_BARE = 0.1  # share of the samples that lack a feature, of each feature
 _EXPOSURES = 8.0  # up to this factor either way: a crop of a frame is darker or brighter than the frame
 _PERMUTATIONS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
@@ -120,6 +121,7 @@ def draw(
         noisy, denoised, biased, memory.albedo.float(), memory.normal.float(), depth, target, level, torch.ones(())
     )
     sample = _turned(_permuted(_cropped(sample, crop, generator), generator), generator)
+    sample = _bared(sample, generator)
     return sample._replace(importance=_importance(sample))
 
 
@@ -173,6 +175,13 @@ def _permuted(sample: Sample, generator: torch.Generator) -> Sample:
         for name in ("noisy", "denoised", "biased", "albedo", "target", "level")
     }
     return sample._replace(normal=sample.normal[axes] * signs, **shown)
+
+
+def _bared(sample: Sample, generator: torch.Generator) -> Sample:
+    """Without some features, which are then 0: not every frame has all."""
+    names = ("albedo", "normal", "depth")
+    kept = (torch.rand(len(names), generator=generator) >= _BARE).to(sample.albedo.dtype).tolist()
+    return sample._replace(**{name: getattr(sample, name) * keep for name, keep in zip(names, kept, strict=True)})
 
 
 def _turned(sample: Sample, generator: torch.Generator) -> Sample:
