@@ -28,7 +28,7 @@ MULTIPLE = 16
 """Height and width are multiples of this: four halvings."""
 
 _BRIGHTEST = 1e8  # of the frame's level; beyond it, float32 loses the frame's other pixels beside it
-_DIMMEST_ALBEDO = 0.02
+_DIMMEST_ALBEDO = 0.1  # of the texture: darker surfaces shine by more than their albedo
 _LOGIT = 16.0  # bound of what weights and kernels are the logistic function and the exponential of, e^-16 = 1e-7
 
 
