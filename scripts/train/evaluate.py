@@ -59,8 +59,8 @@ class Case(NamedTuple):
     references: References
 
 
-def main() -> None:
-    options = parse()
+def main(arguments: list[str] | None = None) -> None:
+    options = parse(arguments)
     torch.set_num_threads(options.threads)
     if options.verb == "speed":
         speed(options.size, options.threads)
@@ -228,7 +228,7 @@ def speed(size: int, threads: int) -> None:
         print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB")
 
 
-def parse() -> argparse.Namespace:
+def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("verb", choices=["quality", "table", "speed"])
     parser.add_argument("--data", type=Path)
@@ -239,7 +239,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--spp", type=int, nargs="*", default=FRAME_SPP)
     parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--threads", type=int, default=1)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     if options.verb != "speed" and options.out is None:
         parser.error("expected --out TABLE.csv")
     return options

@@ -10,6 +10,7 @@ of training and whose scenes those were. The model is compared with torch, on a 
 import argparse
 import json
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,12 @@ LARGEST = 256  # halvings: what export has to be told about sizes, times MULTIPL
 INPUTS = ("color", "albedo", "normal")
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--frame", type=Path, nargs=2, metavar=("A.exr", "B.exr"))
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     saved = torch.load(options.run / "checkpoint.pt", weights_only=True)
     settings, run = saved["settings"], saved["run"]
     network = task_of(settings["network"], settings["architecture"], settings["seed"], settings["crop"]).build()
@@ -69,7 +70,9 @@ def write_onnx(network: Denoiser, path: Path, facts: dict[str, Any]) -> None:
     """Export to ONNX with dynamic height and width, both multiples of :data:`denoiser.MULTIPLE`."""
     example = tuple(torch.rand(1, 3, side * MULTIPLE, 3 * MULTIPLE) for side in (4, 4, 4))
     size = {2 + i: MULTIPLE * torch.export.Dim(name, min=1, max=LARGEST) for i, name in enumerate(("height", "width"))}
-    with torch.no_grad():
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="# The axis name", category=UserWarning)  # three inputs of one size
+        warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)  # within torch
         program = torch.onnx.export(
             network,
             example,

@@ -67,8 +67,9 @@ def relative_squared(result: Tensor, target: Tensor, level: Tensor) -> Tensor:
 class DenoiserTask:
     """Sub-images, halves and frames in turn; relative L2 to what OIDN makes of the frame, so mostly of more samples.
 
-    Noisy targets came to 7.8 times OIDN's error in the time in which this teacher's came to ×××: a network that makes
-    all of an image has much to learn, and the others little. It cannot become better than its teacher.
+    On noisy targets it came to 6.5 times OIDN's error and 10 % too little light in 12 minutes; after six more with this
+    teacher it was at 2.8 times: a network that makes all of an image has much to learn, one that mixes images little.
+    It cannot become better than its teacher.
     """
 
     baseline = "oidn"

@@ -76,8 +76,8 @@ class Run:
                 setattr(self, name, value)
 
 
-def main() -> None:
-    options = parse()
+def main(arguments: list[str] | None = None) -> None:
+    options = parse(arguments)
     torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
     files = {part: dataset.views(options.data / part) for part in ("train", "validation")}
@@ -256,7 +256,7 @@ def count(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def parse() -> argparse.Namespace:
+def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("network", choices=list(TASKS))
     parser.add_argument("--data", type=Path, required=True, help="with train/ and validation/")
@@ -276,7 +276,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--checkpoint-seconds", type=float, default=60.0)
     for name in ARCHITECTURE:
         parser.add_argument(f"--{name}", type=int, help="of the combiners, other than the published one")
-    return parser.parse_args()
+    return parser.parse_args(arguments)
 
 
 if __name__ == "__main__":
