@@ -235,7 +235,7 @@ def validation_view(job: Job, name: str, number: int) -> tuple[View, dict[str, s
 
 
 def exposed(view: View) -> View:
-    """A validation view at an exposure that brings its mean to 1: the metric's 0.01 would hide the errors of dark ones."""
+    """A validation view brought to a mean of 1: the 0.01 of the metric would hide the errors of dark ones."""
     assert view.reference is not None  # they have them
     assert view.smooth is not None
     scale = 1 / float(view.smooth.mean().clamp(min=1e-6))
