@@ -93,6 +93,7 @@ def draw(
     *,
     crop: int,
     biased: Tensor | None = None,
+    target: Tensor | None = None,
 ) -> Sample:
     """One training sample of a view: turned, mirrored, its colours permuted, at a random exposure.
 
@@ -103,6 +104,7 @@ def draw(
         generator: of what is random here.
         crop: side in pixels; the whole view where it is not larger.
         biased: images (K, 3, H, W) to go along.
+        target: (3, H, W), instead of the renders that are no inputs.
     """
     noisy = memory.noisy(keys)
     level = memory.denoised["oidn"][list(keys)].float().mean(0)
@@ -111,7 +113,7 @@ def draw(
         noisy,
         memory.denoised[denoiser][list(keys)].float(),
         noisy[:0] if biased is None else biased,
-        memory.target(keys),
+        memory.target(keys) if target is None else target,
         level,
     ]
     noisy, denoised, biased, target, level = (image * exposure for image in radiance)
