@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 import denoisers
-from selfcorrect import Frame, Settings, cli, correct, exr
+from selfcorrect import Frame, Settings, cli, correct, exr, memory, shot
 from selfcorrect.errors import FileError, FrameError, SettingsError
+from selfcorrect.files import Sources
 from selfcorrect.frame import Half, mean
 from selfcorrect.stages import steps, tiled, weights
 from selfcorrect.stages.deep_combiner import DeepCombiner, feature_planes
@@ -376,6 +377,25 @@ def test_the_command_refuses(
         assert line in errors[0]
         assert told.out == ""
         assert output.read_bytes() == b"before"
+
+
+def test_other_weights_are_another_recipe(renders: list[str], files: dict[str, str], tmp_path: Path) -> None:
+    """A shot's frame that was made with other weights under the same name is not left out."""
+    own = tmp_path / "own.safetensors"
+    recipes = []
+    for name in ("combiner_weights", "combiner_4_weights"):
+        own.write_bytes(Path(files[name]).read_bytes())
+        chosen = settings({}, combiner_weights=str(own))
+        recipes.append(shot.recipe(Sources(*renders[:2]), shot.Habits(chosen, {})))
+    assert recipes[0] != recipes[1]
+
+
+def test_sub_images_count_as_memory(renders: list[str]) -> None:
+    four = Sources(*renders[:2], sub_images=tuple(renders[2:]))
+    with_them, without = (memory.needs(each, Settings()) for each in (four, Sources(*renders[:2])))
+    image = 64 * 70 * 12  # bytes
+    grown = [one - other for one, other in zip(with_them, without, strict=True)]
+    assert grown == [4 * image, 8 * image, 8 * image, 0]
 
 
 def test_help_tells_of_the_weights(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Trained networks on whole images, tile by tile: memory does not grow with the frame.
+"""Trained networks on whole images, tile by tile: their memory does not grow with the frame.
 
 A tile's network sees as much around it as reaches its outputs, so that tiles are equal to the whole but for rounding:
 the convolutions may sum in an order that depends on their size. ``tests/test_trained_stages.py`` holds radiance near 1
