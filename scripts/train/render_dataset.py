@@ -230,7 +230,21 @@ def validation_view(job: Job, name: str, number: int) -> tuple[View, dict[str, s
     view, facts = _view(job, place, Shot(number, name, camera, spp, "joint-bilateral"), rng)
     pair = torch.stack([rendered(place, job.size, job.reference_spp, _seed(rng)) for _ in range(2)])[..., :3]
     smooth = _denoiser("oidn")(pair.mean(0), albedo=view.albedo, normal=view.normal)
-    return view._replace(reference=pair.contiguous(), smooth=smooth), facts | {"reference_spp": str(job.reference_spp)}
+    view = exposed(view._replace(reference=pair.contiguous(), smooth=smooth))
+    return view, facts | {"reference_spp": str(job.reference_spp)}
+
+
+def exposed(view: View) -> View:
+    """A validation view brought to a mean of 1: the 0.01 of the metric would hide the errors of dark ones."""
+    assert view.reference is not None  # they have them
+    assert view.smooth is not None
+    scale = 1 / float(view.smooth.mean().clamp(min=1e-6))
+    return view._replace(
+        color=view.color * scale,
+        denoised={name: images * scale for name, images in view.denoised.items()},
+        reference=view.reference * scale,
+        smooth=view.smooth * scale,
+    )
 
 
 def _made(job: Job, part: str, name: str, numbers: list[int]) -> int:
