@@ -270,6 +270,20 @@ class TestEvaluate:
         assert float(means["oidn"][3]) < 1
 
 
+@pytest.mark.mitsuba
+@pytest.mark.llvm
+def test_rendered_views_go_all_the_way(tmp_path: Path) -> None:
+    """Two procedural rooms, really rendered, trained on and measured."""
+    data = tmp_path / "data"
+    few = ("--views", 1, "--validation", 1, "--size", 32, "--reference-spp", 4, "--workers", 1)
+    (tmp_path / "no scenes").mkdir()
+    rendering = command("render_dataset", tmp_path / "no scenes", "-o", data, *few)
+    subprocess.run(rendering, check=True, stdout=subprocess.DEVNULL, timeout=300)
+    ran(*training("deep-combiner", data, tmp_path / "run", "--steps", 2))
+    said = ran("evaluate", "quality", "--data", data, "--out", tmp_path / "table.csv", "--methods", "noisy", "oidn")
+    assert "| oidn | 1 |" in said
+
+
 def planes(pixels: Tensor) -> Tensor:
     return pixels.permute(2, 0, 1)[None]
 
