@@ -38,8 +38,11 @@ def names() -> tuple[str, ...]:
 
 
 def default() -> str:
-    """Return the denoiser that is used when none is named: oidn where installed, else joint-bilateral."""
-    return "joint-bilateral" if importlib.util.find_spec("mitsuba_oidn") is None else "oidn"
+    """Return the denoiser that is used when none is named: of oidn, onnx and joint-bilateral the first installed."""
+    for package, name in (("mitsuba_oidn", "oidn"), ("onnxruntime", "onnx")):
+        if importlib.util.find_spec(package) is not None:
+            return name
+    return "joint-bilateral"
 
 
 def create(spec: str, *, threads: int | None = None, scratch: int | None = None) -> Denoise:

@@ -10,7 +10,8 @@ blend scales; Balint et al. 2023 let the network weigh the pixels of the pyramid
   blends work on all four channels alike and one division ends it: an outlier is turned down once, on all scales, and
   pixels beyond the border, all zeros, do not count.
 
-The result is a weighted mean of the frame's demodulated radiances: finite and ≥ 0 whatever the network says.
+The result is a weighted mean of the frame's demodulated radiances, and no brighter than the brightest pixel near by:
+finite and ≥ 0 whatever the network says.
 """
 
 import math
@@ -29,6 +30,7 @@ MULTIPLE = 16
 
 _BRIGHTEST = 1e8  # of the frame's level; beyond it, float32 loses the frame's other pixels beside it
 _DIMMEST_ALBEDO = 0.1  # of the texture: darker surfaces shine by more than their albedo
+_AROUND = 11  # pixels; 5 to 21 differ by less than 1 % on four of five development frames, on dim noise 3 cuts light
 _LOGIT = 16.0  # bound of what weights and kernels are the logistic function and the exponential of, e^-16 = 1e-7
 
 
@@ -98,7 +100,8 @@ class Denoiser(nn.Module):
             kept = torch.sigmoid(logit[:, TAPS : TAPS + 1])
             above = F.interpolate(coarse, scale_factor=2.0, mode="bilinear", align_corners=False)
             coarse = _kernel(above + kept * (fine - above), logit)
-        return coarse[:, :3] / coarse[:, 3:].clamp(min=1e-20) * texture
+        result = coarse[:, :3] / coarse[:, 3:].clamp(min=1e-20) * texture
+        return torch.minimum(result, _brightest(radiance))
 
 
 class _Pair(nn.Module):
@@ -121,6 +124,12 @@ def level_of(color: Tensor) -> Tensor:
     """The square of the mean root of each image's radiance, (N, 1, 1, 1): a mean that few bright pixels do not move."""
     roots = color.clamp(min=0).mean(1, keepdim=True).sqrt().mean((2, 3), keepdim=True)
     return (roots * roots).clamp(min=1e-20)
+
+
+def _brightest(radiance: Tensor) -> Tensor:
+    """The largest radiance around each pixel: what divides by a dark texture may come back brighter than any light."""
+    rows = F.max_pool2d(radiance, (_AROUND, 1), 1, (_AROUND // 2, 0))
+    return F.max_pool2d(rows, (1, _AROUND), 1, (0, _AROUND // 2))
 
 
 def _kernel(image: Tensor, logits: Tensor) -> Tensor:
