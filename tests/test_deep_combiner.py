@@ -37,11 +37,14 @@ def test_a_narrower_one() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 7), (13, 11)])
-@pytest.mark.parametrize("buffers", [1, 4])
-def test_eq_14_by_hand(size: tuple[int, int], buffers: int) -> None:
-    """Eq. 8 is Eq. 14 with one buffer: window² weights, y_i − z_i + z_c under each, one sum of weights."""
+@pytest.mark.parametrize(("buffers", "anchored"), [(1, False), (4, False), (1, True), (4, True)])
+def test_eq_14_by_hand(size: tuple[int, int], buffers: int, anchored: bool) -> None:
+    """Eq. 8 is Eq. 14 with one buffer: window² weights, y_i − z_i + z_c under each, one sum of weights.
+
+    An anchor is a weight more, with z_c under it.
+    """
     noisy, denoised, features = (planes.double() for planes in images(size, buffers))
-    network = DeepCombiner(buffers, **SMALL).double()
+    network = DeepCombiner(buffers, **SMALL, anchored=anchored).double()
     weights = network.weights(noisy, denoised, features)
     got = network(noisy, denoised, features)
     assert got.shape == (1, 3, *size)
@@ -54,6 +57,9 @@ def test_eq_14_by_hand(size: tuple[int, int], buffers: int) -> None:
                 w = weights[0, b, tap, row, column]
                 moved = noisy[0, b, :, i[0], i[1]] - denoised[0, b, :, i[0], i[1]]
                 total, weight = total + w * (moved + denoised[0, b, :, row, column]), weight + w
+            if anchored:
+                w = weights[0, b, 25, row, column]
+                total, weight = total + w * denoised[0, b, :, row, column], weight + w
         torch.testing.assert_close(got[0, :, row, column], total / weight)
 
 

@@ -41,7 +41,7 @@ WARM_UP = 0.02  # of the budget
 EMA = 0.999
 LIMIT = 2.0  # of the running geometric mean of the gradient's norm
 MEMORY = 0.02  # of that mean: some 50 steps
-ARCHITECTURE = ("width", "window", "layers", "kernel")
+ARCHITECTURE = ("width", "window", "layers", "kernel", "anchored")
 
 LOSS_COLUMNS = ("step", "seconds", "loss", "gradient", "rate")
 VALIDATION_COLUMNS = ("step", "seconds", "relmse", "to_baseline", "to_noisy", "worst_to_noisy", "radiance")
@@ -274,7 +274,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--validation-views", type=int, default=40)
     parser.add_argument("--validate-minutes", type=float, default=5.0)
     parser.add_argument("--checkpoint-seconds", type=float, default=60.0)
-    for name in ARCHITECTURE:
+    parser.add_argument("--anchored", action="store_true", default=None, help="of the combiners")
+    for name in ARCHITECTURE[:-1]:
         parser.add_argument(f"--{name}", type=int, help="of the combiners, other than the published one")
     return parser.parse_args(arguments)
 

@@ -17,6 +17,7 @@ from selfcorrect.windows import reflected
 __all__ = ["DeepCombiner", "combined", "feature_planes"]
 
 _FEATURES = 7  # normal, albedo, depth
+_FIRST_ANCHOR = 4  # of the window's weights together: training starts near the denoised image
 _LEAST_SUM = 1e-10  # as published
 _BEYOND = 1e9  # depth from here on is a renderer's word for nothing hit (Blender's is 1e10)
 
@@ -38,11 +39,21 @@ class DeepCombiner(nn.Module):
         window: side of the predicted kernels, odd.
         layers: convolutions.
         kernel: side of the convolutions' kernels, odd.
+        anchored: one more output for each buffer, the weight of the denoised image as it is, a residual of 0. Weights
+            that are normalised without one must take in the residuals' noise everywhere. Not in the paper.
         seed: of the first weights.
     """
 
     def __init__(
-        self, buffers: int = 1, width: int = 100, window: int = 15, layers: int = 6, kernel: int = 5, seed: int = 0
+        self,
+        buffers: int = 1,
+        width: int = 100,
+        window: int = 15,
+        layers: int = 6,
+        kernel: int = 5,
+        *,
+        anchored: bool = False,
+        seed: int = 0,
     ):
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
@@ -52,14 +63,18 @@ class DeepCombiner(nn.Module):
             "window": window,
             "layers": layers,
             "kernel": kernel,
+            "anchored": anchored,
         }
         """The arguments that rebuild it."""
         self.pairs, self.window = buffers, window
         self.reach = layers * (kernel // 2)
         """Pixels that a weight sees on each side."""
-        widths = [6 * buffers + _FEATURES, *[width] * (layers - 1), buffers * window**2]
+        taps = window**2 + anchored
+        widths = [6 * buffers + _FEATURES, *[width] * (layers - 1), buffers * taps]
         self.convolutions = nn.ModuleList(convolution(i, o, kernel, generator) for i, o in pairwise(widths))
-        start_flat(self.convolutions[-1], torch.ones(widths[-1]))  # type: ignore[arg-type]  # ModuleList forgets
+        first = torch.ones(buffers, taps)
+        first[:, window**2 :] = _FIRST_ANCHOR * window**2
+        start_flat(self.convolutions[-1], first.flatten())  # type: ignore[arg-type]  # ModuleList forgets
 
     def forward(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
         """The combined radiance (N, 3, H, W).
@@ -74,12 +89,12 @@ class DeepCombiner(nn.Module):
         return combined(weights, residual, denoised, self.window)
 
     def weights(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
-        """Weights (N, B, window², H, W) ≥ 0, by rows of the window; bfloat16 where autocast says so."""
+        """Weights (N, B, window², H, W) ≥ 0, by rows of the window, and the anchor; bfloat16 where autocast says so."""
         shown = [tau(denoised).flatten(1, 2), tau(noisy).flatten(1, 2), features]
         planes = torch.cat(shown, 1).contiguous(memory_format=torch.channels_last)
         for layer in self.convolutions:
             planes = layer(planes).relu()
-        weights: Tensor = planes.unflatten(1, (self.pairs, self.window**2))
+        weights: Tensor = planes.unflatten(1, (self.pairs, -1))
         return weights
 
 
@@ -87,7 +102,7 @@ def combined(weights: Tensor, residual: Tensor, denoised: Tensor, window: int) -
     """Eqs. 14 and 15: ``Σ_b [W^b z^b_c + Σ_i w^b_i (y^b_i − z^b_i)] / Σ_b W^b``, (N, 3, H, W).
 
     Args:
-        weights: (N, B, window², H, W) ≥ 0.
+        weights: (N, B, window², H, W) ≥ 0; with one plane more where the denoised image has a weight of its own.
         residual: y − z, (N, B, 3, H + window − 1, W + window − 1): with its border.
         denoised: z, (N, B, 3, H, W).
         window: side of the kernels.
@@ -95,7 +110,8 @@ def combined(weights: Tensor, residual: Tensor, denoised: Tensor, window: int) -
     base = denoised.mean(1)
     moved, total = torch.zeros_like(base), torch.zeros_like(base[:, :1])
     for b in range(weights.shape[1]):
-        taken, weight = windowed_sum(weights[:, b], residual[:, b], window)
+        taken, weight = windowed_sum(weights[:, b, : window**2], residual[:, b], window)
+        weight = weight + weights[:, b, window**2 :].to(weight.dtype).sum(1, keepdim=True)
         moved = moved + taken + weight * (denoised[:, b] - base)
         total = total + weight
     return base + moved / total.clamp(min=_LEAST_SUM)
