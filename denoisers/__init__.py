@@ -10,12 +10,16 @@ converts, checks, pads and crops. One plug-in is one file here; a user's own is 
 
 import importlib
 import importlib.util
+from pathlib import Path
 from types import ModuleType
 
 from denoisers.host import Denoise, DualPlugin, Plugin
 from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
-__all__ = ["Denoise", "DualPlugin", "Plugin", "create", "default", "names"]
+__all__ = ["PACKAGED", "Denoise", "DualPlugin", "Plugin", "create", "default", "names"]
+
+PACKAGED = Path(__file__).resolve().parent / "weights" / "denoiser.onnx"
+"""The project's own model: ``onnx`` without a path."""
 
 
 def names() -> tuple[str, ...]:
@@ -26,6 +30,7 @@ def names() -> tuple[str, ...]:
         "box",
         "nlm",
         "nfor",
+        "onnx",
         "onnx:MODEL.onnx",
         "command:PROGRAM AND ARGS",
         "file.py:Class",
@@ -33,8 +38,11 @@ def names() -> tuple[str, ...]:
 
 
 def default() -> str:
-    """Return the denoiser that is used when none is named: oidn where installed, else joint-bilateral."""
-    return "joint-bilateral" if importlib.util.find_spec("mitsuba_oidn") is None else "oidn"
+    """Return the denoiser that is used when none is named: of oidn, onnx and joint-bilateral the first installed."""
+    for package, name in (("mitsuba_oidn", "oidn"), ("onnxruntime", "onnx")):
+        if importlib.util.find_spec(package) is not None:
+            return name
+    return "joint-bilateral"
 
 
 def create(spec: str, *, threads: int | None = None, scratch: int | None = None) -> Denoise:
@@ -70,6 +78,8 @@ def _plugin(spec: str, threads: int | None, scratch: int | None) -> Plugin | Dua
             plugin = _adapter("nlm").NonLocalMeans(threads)
         case ["nfor"]:
             plugin = _adapter("nfor").Nfor(threads)
+        case ["onnx"]:
+            plugin = _adapter("onnx", extra="onnx").Onnx(str(PACKAGED), threads)
         case ["onnx", path] if path:
             plugin = _adapter("onnx", extra="onnx").Onnx(path, threads)
         case ["command", line] if line:

@@ -4,7 +4,8 @@ A model fits if it has
 
 - inputs named ``color`` and, if it uses them, ``albedo`` and ``normal``, of 3 channels each; or one input
   of any name with 3, 6 or 9 channels, in the order colour, albedo, normal. A model that takes a feature
-  needs it: a frame without it is refused, for a feature of zeros would be a lie;
+  needs it: a frame without it is refused, for a feature of zeros would be a lie, unless the custom metadata
+  key ``optional`` names it (such as ``albedo normal``): then the model was trained with zeros for what lacks;
 - for each input the layout NCHW or NHWC with N = 1 (or dynamic): NCHW if the second dimension is the
   number of channels, else NHWC if the fourth is. Height and width are dynamic or fixed;
 - float32 or float16 for all inputs and the output (float16 ends at 65504: brighter radiance is clipped);
@@ -88,6 +89,7 @@ class Onnx:
         self.inputs = self._inputs()
         self.output = self._output()
         self.multiple = self._multiple()
+        self.optional = frozenset(self.session.get_modelmeta().custom_metadata_map.get("optional", "").split())
         self.features = frozenset(image for slot in self.inputs for image in slot.images) - {"color"}
 
     def denoise(self, color: torch.Tensor, albedo: torch.Tensor | None, normal: torch.Tensor | None) -> torch.Tensor:
@@ -106,9 +108,9 @@ class Onnx:
             stacked = []
             for name in slot.images:
                 image = images[name]
-                if image is None:
+                if image is None and name not in self.optional:
                     raise DenoiserError(f"{self.path}: expected a frame with {name}, but got one without")
-                stacked.append(image.numpy())
+                stacked.append((torch.zeros_like(color) if image is None else image).numpy())
             feeds[slot.name] = _feed(slot, np.concatenate(stacked, axis=2))
         try:
             result = np.asarray(self.session.run([self.output.name], feeds)[0], dtype=np.float32)

@@ -109,6 +109,7 @@ def load_scene(
         RenderError: Mitsuba does not take the scene.
     """
     config = mi.parser.ParserConfig(mi.variant())
+    mi.file_resolver().prepend(str(path.parent.resolve()))  # where the scene's meshes and textures are
     try:
         state = mi.parser.parse_file(config, str(path), **parameters)
         mi.parser.transform_all(config, state)

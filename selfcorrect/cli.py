@@ -48,6 +48,12 @@ def _parser() -> argparse.ArgumentParser:
 
     frame = commands.add_parser("frame", help="correct one frame")
     add_halves(frame)
+    frame.add_argument(
+        "--sub-images",
+        nargs=4,
+        metavar=("A1.exr", "A2.exr", "B1.exr", "B2.exr"),
+        help="the two renders whose mean is half a, and those of half b, for the stage deep-combiner-4",
+    )
     frame.add_argument("-o", "--output", required=True, metavar="OUT.exr")
     frame.add_argument(
         "--maxmem",
@@ -96,7 +102,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _frame(options: argparse.Namespace) -> None:
     sources = files.Sources(
-        options.a, options.b, options.denoised_a, options.denoised_b, options.denoised, mapping(options)
+        options.a,
+        options.b,
+        options.denoised_a,
+        options.denoised_b,
+        options.denoised,
+        mapping(options),
+        tuple(options.sub_images or ()),
     )
     report = _run(options, sources, options.output)
     if options.json:

@@ -23,6 +23,7 @@ from selfcorrect.frame import Frame
 from selfcorrect.independence import doubts
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
+from selfcorrect.stages import weights
 
 __all__ = [
     "Corrected",
@@ -78,6 +79,9 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
             how = {"type": _seconds, "metavar": "10s"}
         if isinstance(f.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
+        if f.metadata["unit"] == "file":
+            group.add_argument(f"--{f.name.replace('_', '-')}", metavar="FILE", help=f.metadata["help"])
+            continue
         presets = ", ".join(f"{name}: {getattr(s, f.name)}" for name, s in Settings.presets().items())
         group.add_argument(
             f"--{f.name.replace('_', '-')}", default=None, help=f"{f.metadata['help']} ({presets})", **how
@@ -161,6 +165,8 @@ class Runner:
         if options.aov and not self.settings.guard:
             aov = ",".join(options.aov)
             raise SettingsError(f"expected the guard with --aov {aov}, but got settings that turn it off")
+        weights.check(self.settings)
+        _check_sub_images(options, self.settings, given=given)
         _use_machine(options)
         self._options = options
         self._taken: dict[str, list[str]] = {}
@@ -271,6 +277,20 @@ class Runner:
         }
 
 
+def _check_sub_images(options: argparse.Namespace, settings: Settings, *, given: bool) -> None:
+    """Raise where the flag --sub-images and the stage that reads them do not go together."""
+    named, wanted = getattr(options, "sub_images", None), "deep-combiner-4" in settings.stage_names
+    if wanted and not named:
+        raise SettingsError(
+            "expected --sub-images A1.exr A2.exr B1.exr B2.exr, of the command frame, with the stage deep-combiner-4, "
+            "but got none"
+        )
+    if named and not wanted:
+        raise SettingsError(f"expected the stage deep-combiner-4 with --sub-images, but got {settings.stages!r}")
+    if named and given and options.denoiser is None:
+        raise SettingsError("expected --denoiser NAME with --sub-images, which have to be denoised too, but got none")
+
+
 def _facts(frame: Frame, result: Result) -> dict[str, Any]:
     """What --json tells of the frame and of the work done on it."""
     return {
@@ -289,6 +309,11 @@ def _denoised(
 ) -> tuple[Frame, str]:
     """The frame with denoised halves, and who denoised it; a denoiser that is named beats files found beside."""
     if frame.denoised is not None and options.denoiser is None:
+        if frame.sub_images is not None:
+            raise SettingsError(
+                "expected --denoiser NAME with --sub-images, as the halves' files hold denoised images and those of "
+                "the sub-images must be alike, but got none"
+            )
         return frame, "given"
     assert denoise is not None  # created above, in every case that gets here
     start = time.perf_counter()

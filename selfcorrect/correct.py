@@ -16,13 +16,19 @@ from selfcorrect.frame import Frame, mean
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
-from selfcorrect.stages import steps
-from selfcorrect.stages.steps import StageImages
+from selfcorrect.stages import steps, weights
+from selfcorrect.stages.steps import StageImages, SubImage
 from selfcorrect.train import Progress
 
 __all__ = ["Result", "Start", "correct"]
 
-_STEPS = {"regression": steps.regress, "james-stein": steps.james_stein}
+_STEPS = {
+    "regression": steps.regress,
+    "james-stein": steps.james_stein,
+    "neural-james-stein": steps.neural_james_stein,
+    "deep-combiner": steps.deep_combiner,
+    "deep-combiner-4": steps.deep_combiner_4,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +80,19 @@ def correct(
         threads (``torch.set_num_threads``).
 
     Raises:
-        FrameError: the frame has no denoised halves, or ``warm_start`` was trained with other buffers or settings.
+        FrameError: the frame has no denoised halves, or no sub-images for the stage that takes those, or
+            ``warm_start`` was trained with other buffers or settings.
+        FileError: the weights of a trained stage are not there or do not fit.
     """
     settings = settings or Settings.preset(Settings.default())
     if frame.denoised is None:
         raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
     if warm_start is not None and "core" not in settings.stage_names:
         raise FrameError(f"expected the stage core with a warm start, but got the stages {settings.stages}")
+    weights.check(settings)
     given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
-    first = StageImages(frame.halves, given, settings.input_scale or _automatic_scale(frame))
+    sub_images = _sub_images(frame) if "deep-combiner-4" in settings.stage_names else ()
+    first = StageImages(frame.halves, given, settings.input_scale or _automatic_scale(frame), sub_images)
     state, core, seconds = first, None, dict[str, float]()
 
     def timed(name: str, begun: float) -> None:
@@ -118,6 +128,13 @@ def correct(
         input_scale=first.scale,
         start=core.start if core else Start(warm=False),
     )
+
+
+def _sub_images(frame: Frame) -> tuple[SubImage, ...]:
+    if frame.sub_images is None or frame.denoised_sub_images is None:
+        got = "none" if frame.sub_images is None else "such as are not denoised; call frame.denoise(denoiser)"
+        raise FrameError(f"expected a frame with four denoised sub-images for the stage deep-combiner-4, but got {got}")
+    return tuple(SubImage(*each) for each in zip(frame.sub_images, frame.denoised_sub_images, strict=True))
 
 
 def _automatic_scale(frame: Frame) -> float:

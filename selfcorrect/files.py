@@ -32,6 +32,7 @@ class Sources:
         denoised_b: denoised half b.
         denoised: denoised mean of both halves.
         mapping: role → channel, for what no table knows.
+        sub_images: the two renders whose mean is half a, and those of half b; or none.
     """
 
     a: str
@@ -40,6 +41,7 @@ class Sources:
     denoised_b: str | None = None
     denoised: str | None = None
     mapping: Mapping[str, str] | None = None
+    sub_images: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,9 @@ def load(sources: Sources) -> Loaded:
         taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
     if sources.denoised:
         pairs["denoised_full"] = _color_of(sources.denoised, (height, width))
+    if sources.sub_images:
+        _check_different(sources.sub_images)
+        pairs["sub_images"] = tuple(_color_of(path, (height, width)) for path in sources.sub_images)
     return Loaded(Frame(**pairs), Origin(sources.a, taken, stamp))
 
 
@@ -179,9 +184,7 @@ def load_images(paths: Sequence[str]) -> Images:
         FileError: a file cannot be read, or the same file was given twice.
         FrameError: sizes do not fit.
     """
-    for i, path in enumerate(paths):
-        if any(path == other or _same_file(Path(path), Path(other)) for other in paths[:i]):
-            raise FileError(f"{path}: expected renders with seeds of their own, but got the same file twice")
+    _check_different(paths)
     first = exr.load_half(paths[0])
     size = first.buffers["color"].shape[:2]
     colors = [first.buffers["color"], *(_color_of(path, size) for path in paths[1:])]
@@ -208,6 +211,12 @@ def _check_distinct(sources: Sources) -> None:
     if (sources.denoised_a is None) != (sources.denoised_b is None):
         given = sources.denoised_a or sources.denoised_b
         raise SettingsError(f"{given}: expected both denoised halves or none, but got one")
+
+
+def _check_different(paths: Sequence[str]) -> None:
+    for i, path in enumerate(paths):
+        if any(path == other or _same_file(Path(path), Path(other)) for other in paths[:i]):
+            raise FileError(f"{path}: expected renders with seeds of their own, but got the same file twice")
 
 
 def _same_file(a: Path, b: Path) -> bool:

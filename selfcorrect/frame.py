@@ -16,7 +16,9 @@ __all__ = ["Frame", "Half", "Repairs", "mean", "repaired"]
 
 Pair = tuple[Any, Any]
 _CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 1, "depth": 1}
-_RADIANCE = ("color", "denoised", "denoised_full")
+_RADIANCE = ("color", "denoised", "denoised_full", "sub_images", "denoised_sub_images")
+_SUB_IMAGE_TOLERANCE = 5e-3  # of radiance: half floats round to 1/2048, and a mean of such again
+_SUB_IMAGE_PIXELS = 0.01  # share that may differ: what was repaired, or lay beyond half floats
 _FEATURES = ("albedo", "normal", "visibility", "depth")
 
 
@@ -62,6 +64,9 @@ class Frame:
         visibility: 1 channel.
         depth: 1 channel.
         denoised_full: the denoised mean of both halves, a single array.
+        sub_images: four renders with seeds of their own, the first two of them with half a as their mean, the others
+            with half b; for the stage deep-combiner-4.
+        denoised_sub_images: those denoised, each on its own.
 
     Raises:
         FrameError: sizes or channel counts do not fit.
@@ -74,6 +79,8 @@ class Frame:
     visibility: Pair | None = None
     depth: Pair | None = None
     denoised_full: Any = None
+    sub_images: Any = None
+    denoised_sub_images: Any = None
     repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
     constant: list[str] = field(init=False, default_factory=list)
     _like: Any = field(init=False, repr=False, default=None)
@@ -90,13 +97,24 @@ class Frame:
             self._set(name, tuple(pair))
         if self.denoised_full is not None:
             self._set("denoised_full", (self.denoised_full,))
+        for name in ("sub_images", "denoised_sub_images"):
+            if getattr(self, name) is not None:
+                self._set_sub_images(name, getattr(self, name))
+
+    def _set_sub_images(self, name: str, arrays: Any) -> None:
+        if not isinstance(arrays, (tuple, list)) or len(arrays) != 4:
+            got = len(arrays) if isinstance(arrays, (tuple, list)) else type(arrays).__name__
+            raise FrameError(f"expected {name} as four arrays (two of half a, two of half b), but got {got}")
+        self._set(name, tuple(arrays))
+        if name == "sub_images":
+            for half, color, pair in zip("ab", self.color, (self.sub_images[:2], self.sub_images[2:]), strict=True):
+                _check_sub_images(half, color, pair)
 
     def _set(self, name: str, arrays: tuple[Any, ...]) -> None:
         """Check, repair and store the arrays of one buffer."""
         size = None if name == "color" else self.size
         tensors, counts = [], Repairs(0, 0)
-        for half, array in zip("ab", arrays, strict=False):
-            what = name if name == "denoised_full" else f"{name} of half {half}"
+        for what, array in zip(_names(name), arrays, strict=False):
             tensor = _as_tensor(array, what, _CHANNELS.get(name, 3), half=name in _FEATURES)
             if size is not None and tensor.shape[:2] != size:
                 raise FrameError(
@@ -139,11 +157,13 @@ class Frame:
                 albedo and normal may be of half floats. If its ``dual`` is True, it is called once, as
                 ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs.
             full: also denoise the mean of the halves; with a dual denoiser it is the mean of the denoised halves.
+
+        Sub-images are denoised with the G-buffers of their half; by a dual denoiser as the two halves of that.
         """
         if getattr(denoiser, "dual", False):
             features = {name: getattr(self, name) for name in ("albedo", "normal", "depth", "visibility")}
             pair = cast(_Dual, denoiser).pair(self.color, **features)
-            return self.with_denoised(pair, mean(pair) if full else None)
+            return self.with_denoised(pair, mean(pair) if full else None, self._denoised_sub_images(denoiser))
         inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
         denoised_full = None
         if full:  # first: there is no other denoised image in memory yet
@@ -151,9 +171,22 @@ class Frame:
             denoised_full = denoiser(color, albedo=albedo, normal=normal)
             del color, albedo, normal
         pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
-        return self.with_denoised(pair, denoised_full)
+        return self.with_denoised(pair, denoised_full, self._denoised_sub_images(denoiser))
 
-    def with_denoised(self, denoised: Pair, denoised_full: Any = None) -> "Frame":
+    def _denoised_sub_images(self, denoiser: Callable[..., Any]) -> tuple[Any, ...] | None:
+        if self.sub_images is None:
+            return None
+        denoised: list[Any] = []
+        for half, pair in zip(self.halves, (self.sub_images[:2], self.sub_images[2:]), strict=True):
+            if getattr(denoiser, "dual", False):
+                buffers = {name: getattr(half, name) for name in ("albedo", "normal", "depth", "visibility")}
+                features = {name: None if buffer is None else (buffer, buffer) for name, buffer in buffers.items()}
+                denoised += cast(_Dual, denoiser).pair(pair, **features)
+            else:
+                denoised += [denoiser(image, albedo=half.albedo, normal=half.normal) for image in pair]
+        return tuple(denoised)
+
+    def with_denoised(self, denoised: Pair, denoised_full: Any = None, denoised_sub_images: Any = None) -> "Frame":
         """This frame with these denoised images; its other buffers are not checked again."""
         frame = object.__new__(Frame)
         for name, value in vars(self).items():
@@ -162,12 +195,14 @@ class Frame:
         frame._set("denoised", denoised)
         if denoised_full is not None:
             frame._set("denoised_full", (denoised_full,))
+        if denoised_sub_images is not None:
+            frame._set_sub_images("denoised_sub_images", denoised_sub_images)
         return frame
 
     def to(self, device: str | torch.device) -> "Frame":
         """This frame with all its tensors on ``device``."""
         frame = self.with_denoised(self.denoised) if self.denoised is not None else self
-        for name in (*_CHANNELS, "denoised_full"):
+        for name in (*_CHANNELS, "denoised_full", "sub_images", "denoised_sub_images"):
             value = getattr(self, name)
             if isinstance(value, tuple):
                 object.__setattr__(frame, name, tuple(tensor.to(device) for tensor in value))
@@ -199,6 +234,27 @@ def repaired(image: Any, what: str) -> Tensor:
         FrameError: it has another shape or no floating-point numbers; ``what`` names it.
     """
     return _repair(_as_tensor(image, what, 3, half=False), radiance=False)[0]
+
+
+def _names(name: str) -> tuple[str, ...]:
+    """What the arrays of a buffer are called."""
+    if name == "denoised_full":
+        return (name,)
+    if name.endswith("sub_images"):
+        return tuple(f"{name} of half {half}, {which}" for half in "ab" for which in ("first", "second"))
+    return tuple(f"{name} of half {half}" for half in "ab")
+
+
+def _check_sub_images(half: str, color: Tensor, pair: tuple[Tensor, Tensor]) -> None:
+    """Raise where the sub-images have another mean than their half."""
+    found = mean(pair)
+    differing = ((found - color).abs() > _SUB_IMAGE_TOLERANCE * found.abs() + 1e-6).any(-1)
+    share = float(differing.float().mean())
+    if share > _SUB_IMAGE_PIXELS:
+        raise FrameError(
+            f"expected two sub-images whose mean is half {half}, but got others at {share:.0%} of its pixels; "
+            "give the two renders of half a, then those of half b"
+        )
 
 
 def _empty_like(array: Any) -> Any:

@@ -10,7 +10,7 @@ from selfcorrect.kernel import Guides, cross_bilateral
 from selfcorrect.network import Network
 from selfcorrect.settings import Settings
 
-__all__ = ["TILE", "infer", "infer_tile", "tiles"]
+__all__ = ["TILE", "Region", "infer", "infer_tile", "tiles"]
 
 TILE = 512  # pixels; the network reads 9 more on each side, so that 7 % of the work is done twice
 

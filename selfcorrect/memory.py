@@ -83,11 +83,12 @@ def needs(sources: Sources, settings: Settings) -> Needs:
     planes = 2 + len(features.keys() & {"albedo", "normal"}) + ("visibility" in features) / 3
     trained = sum((b - t) * (r - x) for t, x, b, r in crops((height, width), settings, torch.Generator())) or pixels
     training = 1.2 * trained * 2 * (planes * _RGB + 4)  # 1.2: margins
+    sub_images = len(sources.sub_images) * image
     evidence = pixels * 16 if settings.guard else 0
     return Needs(
-        read=_BASE + half + held + max(stored, half),
-        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image,
-        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence),
+        read=_BASE + half + held + max(stored, half) + sub_images,
+        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * sub_images,
+        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * sub_images,
         write=_BASE + _WORK + 2 * image + held + max(stored, held),
     )
 

@@ -11,6 +11,7 @@ __all__ = ["Settings"]
 _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench_quality.py measures it"
 _WARM = "not in the paper; scripts/bench_shot.py measures it"
+_TRAINED = "the package's own are trained by scripts/train"
 _STAGES = "not in the paper; scripts/bench_stages.py measures it"
 
 
@@ -40,7 +41,7 @@ def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) ->
         raise SettingsError(f"expected {name} of at least {metadata['least']}, but got {value!r}")
 
 
-STAGES = ("regression", "core", "james-stein")
+STAGES = ("regression", "core", "james-stein", "neural-james-stein", "deep-combiner", "deep-combiner-4")
 
 
 def _check_stages(stages: str) -> None:
@@ -48,6 +49,10 @@ def _check_stages(stages: str) -> None:
     unknown = [name for name in names if name not in STAGES]
     if unknown or len(set(names)) < len(names):
         raise SettingsError(f"expected stages out of {','.join(STAGES)}, each at most once, but got {stages!r}")
+    if "deep-combiner-4" in names[1:]:
+        raise SettingsError(
+            f"expected deep-combiner-4 as the first stage, as it reads what the denoiser gave, but got {stages!r}"
+        )
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,15 @@ class Settings:
     stages: str = _setting("core", f"what runs, in this order, before the guard: out of {','.join(STAGES)}", _STAGES)
     regression_stride: int = _setting(
         2, "the stage regression solves a model at every so many-th pixel of as many rows", _STAGES, least=1
+    )
+    james_stein_weights: str = _setting(
+        "", "trained weights of the stage neural-james-stein; by default the package's", _TRAINED, unit="file"
+    )
+    combiner_weights: str = _setting(
+        "", "trained weights of the stage deep-combiner; by default the package's", _TRAINED, unit="file"
+    )
+    combiner_4_weights: str = _setting(
+        "", "trained weights of the stage deep-combiner-4; by default the package's", _TRAINED, unit="file"
     )
     combination: str = _setting(
         "eq10", "what the window's pixels are combined to", f"{_PAPER}, Table 1", choices=("eq10", "eq3")
@@ -130,6 +144,13 @@ class Settings:
             raise SettingsError(f"expected an odd window of at most 31, but got {self.window}")
         if not self.steps and self.stride > self.patch:
             raise SettingsError(f"expected a stride of at most the patch ({self.patch}), but got {self.stride}")
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that settings name."""
+        return tuple(
+            getattr(self, f.name) for f in fields(self) if f.metadata["unit"] == "file" and getattr(self, f.name)
+        )
 
     @property
     def stage_names(self) -> tuple[str, ...]:

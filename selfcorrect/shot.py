@@ -58,7 +58,7 @@ class Shot:
             SettingsError: a name has no place for the number.
         """
         given = {"denoised_a": self.denoised_a, "denoised_b": self.denoised_b, "denoised": self.denoised}
-        names = {role: fill(name, frame) for role, name in given.items() if name is not None}
+        names: dict[str, Any] = {role: fill(name, frame) for role, name in given.items() if name is not None}
         return files.Sources(fill(self.a, frame), fill(self.b, frame), **names, mapping=self.mapping)
 
     def target(self, frame: int) -> str:
@@ -313,7 +313,7 @@ def recipe(sources: files.Sources, habits: Habits) -> str:
     beside = [
         str(path) for half in (sources.a, sources.b) for path in channels.siblings(half.partition("::")[0]).values()
     ]
-    contents = [_digest(path) for path in (*(path for path, _, _ in parts), *sorted(beside))]
+    contents = [_digest(path) for path in (*(path for path, _, _ in parts), *sorted(beside), *habits.settings.files)]
     how = {
         "version": version("selfcorrect"),
         "settings": habits.settings.to_dict(),

@@ -252,6 +252,8 @@ class TestSpecifications:
         assert denoisers.names()[:3] == ("oidn", "joint-bilateral", "box")
         assert denoisers.default() == "oidn"
         monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+        assert denoisers.default() == "onnx"
+        monkeypatch.setitem(sys.modules, "onnxruntime", None)
         assert denoisers.default() == "joint-bilateral"
 
     @pytest.mark.parametrize("spec", ["", "optix", "OIDN", "box:3", "onnx:", "command:", "my.py", "my.py:", "a:b"])

@@ -6,10 +6,12 @@ import numpy as np
 import onnx
 import pytest
 from helpers.onnx_models import NCHW, NHWC, Shape, convolution, info, save, sum_of
+from helpers.views import make_view
 from onnx import TensorProto, helper
 
 import denoisers
 from denoisers.onnx import Onnx
+from selfcorrect import metrics
 from selfcorrect.errors import DenoiserError, FileError
 
 RNG = np.random.default_rng(0)
@@ -150,3 +152,33 @@ def test_no_file_and_no_model(tmp_path: Path) -> None:
         (tmp_path / "bad.onnx").write_bytes(content)
         with pytest.raises(DenoiserError, match=r"bad\.onnx: expected an ONNX model, but got"):
             create(tmp_path / "bad.onnx")
+
+
+class TestPackaged:
+    """The project's own model: ``onnx`` without a path."""
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_it_denoises_what_it_was_not_trained_on(self, seed: int) -> None:
+        view = make_view(seed, 61, clean=True)
+        assert view.reference is not None
+        noisy, clean = view.color[:4].mean(0), view.reference[0]
+        denoise = denoisers.create("onnx", threads=1)
+        before = metrics.relmse(noisy, clean)
+        assert metrics.relmse(denoise(noisy, albedo=view.albedo, normal=view.normal), clean) < before / 2
+        assert metrics.relmse(denoise(noisy), clean) < before
+
+    def test_it_is_small_and_says_whose_scenes_it_has_seen(self) -> None:
+        assert denoisers.PACKAGED.stat().st_size < 4e6
+        facts = {entry.key: entry.value for entry in onnx.load(denoisers.PACKAGED).metadata_props}
+        assert facts["multiple"] == "16"
+        assert len(facts["data"]) == 64
+        for author in ("Mareck", "NovaZeeke", "Wig42", "Jay-Artist"):
+            assert author in facts["attribution"]
+
+    @pytest.mark.parametrize("value", [0.0, 1e6, 1e30])
+    def test_extremes_stay_finite(self, value: float) -> None:
+        color = COLOR.copy()
+        color[3, 4] = value
+        result = denoisers.create("onnx", threads=1)(color, ALBEDO, NORMAL)
+        assert np.isfinite(result).all()
+        assert not denoisers.create("onnx", threads=1)(0 * color, ALBEDO, NORMAL).any()

@@ -143,6 +143,16 @@ def test_a_single_frame_with_parameters(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.mitsuba
+def test_a_scene_finds_the_files_beside_it(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "patch.obj").write_text("v -1 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    mesh = '<shape type="obj"><string name="filename" value="models/patch.obj"/></shape></scene>'
+    (tmp_path / "near.xml").write_text(MITSUBA_SCENE.replace("</scene>", mesh))
+    done("render_mitsuba", tmp_path / "near.xml", "-o", tmp_path, "--spp", 2, *SCALAR)
+    assert color(tmp_path / "near_a.exr").shape == (20, 30, 3)
+
+
+@pytest.mark.mitsuba
 def test_samples_in_several_passes(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import mitsuba
     import render_mitsuba

@@ -1,0 +1,140 @@
+"""Deep combiner: kernels predicted for an unbiased and a denoised image (Back et al. 2020).
+
+Every pixel is its denoised radiance plus a weighted mean over 15×15 pixels of what the denoiser has taken away (Eqs. 8
+and 15): ``β_c = z_c + Σ w_i (y_i − z_i) / W``. With several buffers the sums run over all of them with one W (Eq. 14),
+so that an outlier in one buffer loses its weight to the same pixel in the others.
+"""
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from selfcorrect.stages.layers import convolution, start_flat, tau
+from selfcorrect.stages.taps import windowed_sum
+from selfcorrect.windows import reflected
+
+__all__ = ["DeepCombiner", "combined", "feature_planes"]
+
+_FEATURES = 7  # normal, albedo, depth
+_FIRST_ANCHOR = 4  # of the window's weights together: training starts near the denoised image
+_LEAST_SUM = 1e-10  # as published
+_BEYOND = 1e9  # depth from here on is a renderer's word for nothing hit (Blender's is 1e10)
+
+
+class DeepCombiner(nn.Module):
+    """Six convolutions 5×5 of 100 filters and kernels of 15×15, ReLU after every layer including the last.
+
+    It has one output for each pixel of the window and buffer, the centre among them, as the public code does: 1,595,725
+    parameters with one buffer, 3,328,900 with four. The paper counts |Ω| + 1 outputs (1,598,226 parameters), but the
+    centre's own weight in its Eq. 8 adds to that which the centre has as a pixel of the window.
+
+    It sees τ(x) = sign(x) ln(1 + |x|) of the radiance: fireflies do not leave the range that it was trained in. The
+    combination itself is linear. Before any training all weights are nearly equal. Where all are 0, the denoised image
+    (of several buffers, their mean) comes back.
+
+    Args:
+        buffers: B, pairs of a noisy and a denoised image.
+        width: filters of each hidden layer.
+        window: side of the predicted kernels, odd.
+        layers: convolutions.
+        kernel: side of the convolutions' kernels, odd.
+        anchored: one more output for each buffer, the weight of the denoised image as it is, a residual of 0. Weights
+            that are normalised without one must take in the residuals' noise everywhere. Not in the paper.
+        seed: of the first weights.
+    """
+
+    def __init__(
+        self,
+        buffers: int = 1,
+        width: int = 100,
+        window: int = 15,
+        layers: int = 6,
+        kernel: int = 5,
+        *,
+        anchored: bool = False,
+        seed: int = 0,
+    ):
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.architecture = {
+            "buffers": buffers,
+            "width": width,
+            "window": window,
+            "layers": layers,
+            "kernel": kernel,
+            "anchored": anchored,
+        }
+        """The arguments that rebuild it."""
+        self.pairs, self.window = buffers, window
+        self.reach = layers * (kernel // 2)
+        """Pixels that a weight sees on each side."""
+        taps = window**2 + anchored
+        widths = [6 * buffers + _FEATURES, *[width] * (layers - 1), buffers * taps]
+        self.convolutions = nn.ModuleList(convolution(i, o, kernel, generator) for i, o in pairwise(widths))
+        first = torch.ones(buffers, taps)
+        first[:, window**2 :] = _FIRST_ANCHOR * window**2
+        start_flat(self.convolutions[-1], first.flatten())  # type: ignore[arg-type]  # ModuleList forgets
+
+    def forward(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
+        """The combined radiance (N, 3, H, W).
+
+        Args:
+            noisy: y, linear radiance of a mean near 1, (N, B, 3, H, W).
+            denoised: z, the same shape.
+            features: normal, albedo, depth in 0 … 1, (N, 7, H, W); zeros where a frame has none.
+        """
+        weights = self.weights(noisy, denoised, features)
+        residual = reflected(noisy - denoised, self.window // 2)
+        return combined(weights, residual, denoised, self.window)
+
+    def weights(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
+        """Weights (N, B, window², H, W) ≥ 0, by rows of the window, and the anchor; bfloat16 where autocast says so."""
+        shown = [tau(denoised).flatten(1, 2), tau(noisy).flatten(1, 2), features]
+        planes = torch.cat(shown, 1).contiguous(memory_format=torch.channels_last)
+        for layer in self.convolutions:
+            planes = layer(planes).relu()
+        weights: Tensor = planes.unflatten(1, (self.pairs, -1))
+        return weights
+
+
+def combined(weights: Tensor, residual: Tensor, denoised: Tensor, window: int) -> Tensor:
+    """Eqs. 14 and 15: ``Σ_b [W^b z^b_c + Σ_i w^b_i (y^b_i − z^b_i)] / Σ_b W^b``, (N, 3, H, W).
+
+    Args:
+        weights: (N, B, window², H, W) ≥ 0; with one plane more where the denoised image has a weight of its own.
+        residual: y − z, (N, B, 3, H + window − 1, W + window − 1): with its border.
+        denoised: z, (N, B, 3, H, W).
+        window: side of the kernels.
+    """
+    base = denoised.mean(1)
+    moved, total = torch.zeros_like(base), torch.zeros_like(base[:, :1])
+    for b in range(weights.shape[1]):
+        taken, weight = windowed_sum(weights[:, b, : window**2], residual[:, b], window)
+        weight = weight + weights[:, b, window**2 :].to(weight.dtype).sum(1, keepdim=True)
+        moved = moved + taken + weight * (denoised[:, b] - base)
+        total = total + weight
+    return base + moved / total.clamp(min=_LEAST_SUM)
+
+
+def feature_planes(
+    size: tuple[int, int], *, normal: Tensor | None, albedo: Tensor | None, depth: Tensor | None
+) -> Tensor:
+    """What the combiner is shown of the G-buffers, (7, H, W) float32; zeros for those that are None.
+
+    Args:
+        size: (H, W).
+        normal: (H, W, 3), of unit length, in world space.
+        albedo: (H, W, 3), 0 … 1.
+        depth: (H, W, 1), ≥ 0, any unit: it is divided by its largest value in the image. Where nothing was hit, it
+            is 0, or 1e9 and more.
+    """
+    if depth is not None:
+        depth = torch.where(depth.float() < _BEYOND, depth.float(), 0.0).clamp(min=0)
+        depth = depth / depth.amax().clamp(min=torch.finfo(torch.float32).tiny)
+    planes = torch.zeros(_FEATURES, *size)
+    for first, buffer in ((0, normal), (3, albedo), (6, depth)):
+        if buffer is not None:
+            planes = planes.to(buffer.device)
+            planes[first : first + buffer.shape[2]] = buffer.permute(2, 0, 1)
+    return planes
