@@ -6,7 +6,7 @@
 
 quality: one row a frame and method, written at once; rows that the file has are not measured again. relMSE is that of
 ``selfcorrect.metrics`` with two references and the smooth one. Denoisers are run on the mean of both halves; all else
-starts from OIDN's images. The guard is on where stages follow one another with the core among them, else off.
+starts from OIDN's images. The guard is on where the core runs, else off.
 ``box,…`` are a box filter's images in place of OIDN's: a bad biased image for James–Stein. table: geometric means as
 Markdown, over the noisy image and over OIDN. speed: seconds of the networks, and the sizes of their weights.
 """
@@ -153,11 +153,12 @@ def result_of(
         return image
     stages = method.removeprefix("box,")
     given = denoised("oidn" if stages == method else "box")
-    before, core, after = stages.partition("core")
+    before, core, _ = stages.partition("core")
     if core and before not in networks:
         networks[before] = correct(given, Settings.preset("balanced", stages=before + core, guard=False)).network
-    guard = bool(core and (before or after))
-    settings = Settings.preset("balanced", stages=stages, guard=guard, **({"steps": 0, "epochs": 0} if core else {}))
+    settings = Settings.preset(
+        "balanced", stages=stages, guard=bool(core), **({"steps": 0, "epochs": 0} if core else {})
+    )
     result: Tensor = correct(given, settings, warm_start=networks[before] if core else None).image
     return result
 

@@ -116,7 +116,14 @@ def settings_of(options: argparse.Namespace, checksum: str) -> dict[str, Any]:
         **{name: getattr(options, name) for name in names},
         "architecture": {name: value for name, value in given.items() if value is not None},
         "data": checksum,
+        "initial": provenance(options.initial) if options.initial else None,
     }
+
+
+def provenance(run: Path) -> dict[str, Any]:
+    """What made the weights of a run that another one starts from."""
+    saved = torch.load(run / "checkpoint.pt", weights_only=True)
+    return {**saved["settings"], "hours": round(saved["run"]["seconds"] / 3600, 3), "steps": saved["run"]["step"]}
 
 
 def begin(task: Task, options: argparse.Namespace) -> Run:
