@@ -169,7 +169,7 @@ class TestTraining:
         ran(*training("denoiser", data, tmp_path / "unbroken", *steps))
         broken = training("denoiser", data, tmp_path / "broken", *steps, "--checkpoint-seconds", 0)
         process = subprocess.Popen(command(*map(str, broken)), stdout=subprocess.DEVNULL)
-        while not (tmp_path / "broken" / "checkpoint.pt").exists():
+        while not (tmp_path / "broken" / "losses.csv").exists():
             assert process.poll() is None
             time.sleep(0.01)
         os.kill(process.pid, signal.SIGKILL)
