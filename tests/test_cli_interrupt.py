@@ -13,20 +13,7 @@ from helpers.commands import refused, run
 
 from selfcorrect import cli
 
-ENDLESS = [
-    "--steps",
-    "1000000",
-    "--patch",
-    "16",
-    "--batch",
-    "1",
-    "--window",
-    "5",
-    "--denoiser",
-    "box",
-    "--threads",
-    "1",
-]
+ENDLESS = "--steps 1000000 --visits 0 --patch 16 --batch 1 --window 5 --denoiser box --threads 1".split()
 
 
 def interrupted(out: Path, halves: tuple[Path, Path]) -> subprocess.CompletedProcess[str]:

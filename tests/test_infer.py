@@ -137,7 +137,7 @@ def test_a_time_budget_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "perf_counter", clock)
     monkeypatch.setattr("selfcorrect.core._GUARD_SECONDS", 0.5 / (40 * 50))
     frame = make_frame(40, 50)
-    result = correct(frame, Settings.preset("balanced", steps=100_000, time_budget=3.0, window=5, patch=16))
+    result = correct(frame, Settings.preset("balanced", steps=100_000, visits=0, time_budget=3.0, window=5, patch=16))
     assert 1 < result.seconds["train"] < 2.6, "half a second is kept for the guard"
     assert clock.now < 3.3
     assert 0 < len(result.losses) < 100_000

@@ -43,7 +43,7 @@ def test_metadata_tells_the_origin(tmp_path: Path) -> None:
     path = saved(tmp_path / "w.safetensors", DeepCombiner(**SMALL))
     with safetensors.safe_open(path, framework="pt") as file:
         metadata = file.metadata()
-    assert json.loads(metadata["architecture"]) == {"buffers": 1, **SMALL}
+    assert json.loads(metadata["architecture"]) == {"buffers": 1, **SMALL, "anchored": False}
     assert json.loads(metadata["settings"]) == {"steps": 3}
     assert (metadata["data"], metadata["attribution"]) == ("0123abcd", "a scene by someone, CC-BY")
 
