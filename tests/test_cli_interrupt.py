@@ -13,7 +13,22 @@ from helpers.commands import refused, run
 
 from selfcorrect import cli
 
-ENDLESS = "--steps 1000000 --visits 0 --patch 16 --batch 1 --window 5 --denoiser box --threads 1".split()
+ENDLESS = [
+    "--steps",
+    "1000000",
+    "--visits",
+    "0",
+    "--patch",
+    "16",
+    "--batch",
+    "1",
+    "--window",
+    "5",
+    "--denoiser",
+    "box",
+    "--threads",
+    "1",
+]
 
 
 def interrupted(out: Path, halves: tuple[Path, Path]) -> subprocess.CompletedProcess[str]:
