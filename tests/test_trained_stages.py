@@ -8,13 +8,14 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+from helpers.witness import share_of_witness
 from torch import Tensor
 
 import denoisers
 from selfcorrect import Frame, Settings, cli, correct, exr, memory, shot
 from selfcorrect.errors import FileError, FrameError, SettingsError
 from selfcorrect.files import Sources
-from selfcorrect.frame import Half, mean
+from selfcorrect.frame import mean
 from selfcorrect.stages import steps, tiled, weights
 from selfcorrect.stages.deep_combiner import DeepCombiner, feature_planes
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
@@ -23,6 +24,7 @@ from selfcorrect.stages.steps import StageImages, SubImage
 
 SMALL = {"width": 8, "window": 5, "layers": 3, "kernel": 3}
 SIZE = (44, 39)
+_FLIP = 2 * 2**-8 / SMALL["window"] ** 2  # two of a pixel's weights rounded to their neighbours in bfloat16
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +81,7 @@ def state_of(frame: Frame, scale: float = 1.0) -> StageImages:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 70), (64, 64), (101, 83)])
-@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-6), ("bf16", 1e-3)])
+@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-6), ("bf16", 1e-4)])
 def test_tiles_are_equal_to_the_whole(size: tuple[int, int], precision: str, tolerance: float) -> None:
     frame = make_frame(size)
     a, b = frame.color
@@ -94,7 +96,9 @@ def test_tiles_are_equal_to_the_whole(size: tuple[int, int], precision: str, tol
         return one, tiled.neural_james_stein(variance_network, mean((a, b)), ((a - b) / 2) ** 2, *y, **options)
 
     for whole, pieces, different in zip(both(4096), both(32), (a, mean((a, b))), strict=True):
-        torch.testing.assert_close(pieces, whole, rtol=0, atol=tolerance)
+        found = (pieces - whole).abs()
+        assert float(found.quantile(0.999)) <= tolerance
+        assert float(found.max()) <= max(tolerance, _FLIP if precision == "bf16" else 0)
         assert size == (1, 1) or float((whole - different).abs().max()) > 0.05, "the stage has done something"
 
 
@@ -162,18 +166,10 @@ def test_a_combined_half_knows_nothing_of_its_witness(name: str, files: dict[str
 @pytest.mark.parametrize("heavy", [False, True])
 def test_a_james_stein_half_knows_little_of_its_witness(heavy: bool, files: dict[str, str]) -> None:
     """As for the classical variant: of half b it sees the variance alone, never the image."""
-    generator = torch.Generator().manual_seed(0)
-    size, shares = (96, 96, 3), []
-    for _ in range(4):
-        errors = [0.1 * torch.randn(size, generator=generator) for _ in "ab"]
-        if heavy:
-            errors = [0.02 * (torch.exp(15 * e) - 3.08) for e in errors]  # log-normal, mean 0
-        halves = [Half(1 + e, torch.full(size, 0.95), None, None, None, None) for e in errors]
-        state = StageImages((halves[0], halves[1]), torch.full(size, 0.95))
-        images = steps.neural_james_stein(state, settings(files)).images
-        for i in (0, 1):
-            shares.append(float(((images[i] - 1) * errors[1 - i]).mean() / errors[1 - i].var()))
-    assert abs(sum(shares) / len(shares)) < 0.005, shares
+    assert (
+        abs(share_of_witness(lambda state: steps.neural_james_stein(state, settings(files)), heavy=heavy, side=96))
+        < 0.005
+    )
 
 
 def test_neural_james_stein_by_hand(files: dict[str, str]) -> None:

@@ -77,7 +77,8 @@ def load(path: Path) -> View:
     """Read a view."""
     with safe_open(path, "pt") as file:
         facts = file.metadata()
-        tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118  (it is no dict)
+        names: list[str] = file.keys()
+        tensors = {name: file.get_tensor(name).float() for name in names}
     denoised = {name.removeprefix(_PREFIX): tensors[name] for name in sorted(tensors) if name.startswith(_PREFIX)}
     return View(
         path.stem,

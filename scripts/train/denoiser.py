@@ -113,7 +113,7 @@ class _Pair(nn.Module):
         self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
         for convolution in (self.first, self.second):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
-            nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]  # there is one
+            nn.init.zeros_(convolution.bias)
 
     def forward(self, x: Tensor) -> Tensor:
         x = F.relu(self.first(x))

@@ -14,6 +14,7 @@ Needs the extra `render` and the LLVM shared library, see `render_mitsuba.py`.
 """
 
 import argparse
+import importlib
 import os
 import sys
 import time
@@ -31,17 +32,15 @@ import drjit
 import mitsuba as mi
 import numpy as np
 import torch
+from dataset import View, inputs_of, metadata_of, save, views
+from render_mitsuba import CRN, load_scene
+from rooms import room
+from scene import still_life
+from variation import Camera, Variation, original_camera, random_camera, sensor
 
-mi.set_variant("llvm_ad_rgb")
+import denoisers
 
-import common_random_numbers  # noqa: E402, F401  (registers the sampler)
-from dataset import View, inputs_of, metadata_of, save, views  # noqa: E402
-from render_mitsuba import CRN, load_scene  # noqa: E402
-from rooms import room  # noqa: E402
-from scene import still_life  # noqa: E402
-from variation import Camera, Variation, original_camera, random_camera, sensor  # noqa: E402
-
-import denoisers  # noqa: E402
+importlib.import_module(CRN)  # sets the LLVM variant, and registers the sampler in it
 
 SIZE = 128
 SPP = (8, 16, 24, 32, 48, 64, 96, 128)  # of a frame
@@ -148,6 +147,7 @@ def rendered(place: Loaded, size: int, spp: int, seed: int, sampler: str = "inde
             place.scene, sensor=_sensor(size, sampler), integrator=_integrator(), spp=samples, seed=seed + number
         )
         total = total + np.array(image, dtype=np.float64) * (samples / spp)
+    # a sample that the renderer lost takes its pixel with it, as black: one view has five renders, and the others go on
     return torch.from_numpy(np.nan_to_num(np.asarray(total), posinf=0.0, neginf=0.0)).float()
 
 

@@ -80,7 +80,7 @@ class DenoiserTask:
     def build(self) -> nn.Module:
         """See :class:`Task`."""
         torch.manual_seed(self.seed)
-        return Denoiser(**self.architecture).to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stub
+        return Denoiser(**self.architecture).to(memory_format=torch.channels_last)
 
     def sample(self, number: int, memory: Memory, generator: torch.Generator) -> Sample:
         """See :class:`Task`."""

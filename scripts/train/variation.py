@@ -109,8 +109,9 @@ class Variation:
         self.parameters = mi.traverse(scene)
         ends = ("reflectance.value", "reflectance.data", "alpha", "alpha.value", "radiance.value")
         ends += ("sun_direction", "specular_reflectance.value")
-        names = [name for name in self.parameters.keys() if name.endswith(ends)]  # noqa: SIM118  (it is no dict)
-        self.original = {name: type(self.parameters[name])(self.parameters[name]) for name in names}
+        names: list[str] = self.parameters.keys()
+        drawn = [name for name in names if name.endswith(ends)]
+        self.original = {name: type(self.parameters[name])(self.parameters[name]) for name in drawn}
 
     def draw(self, rng: Rng) -> None:
         """Draw every material and light; one scene in four keeps its own."""

@@ -71,10 +71,11 @@ class DeepCombiner(nn.Module):
         """Pixels that a weight sees on each side."""
         taps = window**2 + anchored
         widths = [6 * buffers + _FEATURES, *[width] * (layers - 1), buffers * taps]
-        self.convolutions = nn.ModuleList(convolution(i, o, kernel, generator) for i, o in pairwise(widths))
+        made = [convolution(i, o, kernel, generator) for i, o in pairwise(widths)]
+        self.convolutions = nn.ModuleList(made)
         first = torch.ones(buffers, taps)
         first[:, window**2 :] = _FIRST_ANCHOR * window**2
-        start_flat(self.convolutions[-1], first.flatten())  # type: ignore[arg-type]  # ModuleList forgets
+        start_flat(made[-1], first.flatten())
 
     def forward(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
         """The combined radiance (N, 3, H, W).

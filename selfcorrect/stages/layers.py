@@ -14,7 +14,7 @@ def convolution(inputs: int, outputs: int, kernel: int, generator: torch.Generat
     """Zero padding, He-uniform weights and zero biases; the caller's random numbers are left alone."""
     layer: nn.Conv2d = nn.utils.skip_init(nn.Conv2d, inputs, outputs, kernel, padding=kernel // 2)
     nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
-    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]  # Optional in its stub; it has one
+    nn.init.zeros_(_bias(layer))
     return layer
 
 
@@ -22,7 +22,12 @@ def start_flat(layer: nn.Conv2d, biases: Tensor) -> None:
     """Let a last layer start with nearly these outputs at every pixel."""
     with torch.no_grad():
         layer.weight.mul_(_START_SPREAD)
-        layer.bias.copy_(biases)  # type: ignore[union-attr]  # Optional in its stub; it has one
+        _bias(layer).copy_(biases)
+
+
+def _bias(layer: nn.Conv2d) -> Tensor:
+    assert layer.bias is not None  # the convolutions here have one
+    return layer.bias
 
 
 def tau(radiance: Tensor) -> Tensor:

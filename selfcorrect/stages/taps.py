@@ -5,6 +5,7 @@ single precision. :func:`windowed_sum` walks over shifted views instead, on the 
 beside the weights and their gradient. :func:`windowed_sum_reference` is the readable one.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -34,7 +35,8 @@ def windowed_sum(weights: Tensor, padded: Tensor, window: int) -> tuple[Tensor, 
     kind = torch.float64 if weights.dtype == torch.float64 else torch.float32
     counted = torch.cat([padded.to(kind), padded.new_ones(1, dtype=kind).expand_as(padded[:, :1])], 1)
     # one plane a tap: the networks' outputs lie with the taps innermost
-    total: Tensor = _WindowedSum.apply(weights.contiguous(), counted, window)  # type: ignore[no-untyped-call]  # torch's
+    apply: Callable[..., Tensor] = _WindowedSum.apply  # torch leaves it untyped
+    total = apply(weights.contiguous(), counted, window)
     return total[:, :-1], total[:, -1:]
 
 

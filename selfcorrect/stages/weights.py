@@ -77,7 +77,8 @@ def load(path: str | Path) -> nn.Module:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata: dict[str, str] = file.metadata() or {}
-            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118  # not a dict
+            names: list[str] = file.keys()
+            tensors = {name: file.get_tensor(name).float() for name in names}
     except OSError as error:
         raise FileError(f"{path}: expected trained weights, but got: {error.strerror or error}") from None
     except safetensors.SafetensorError as error:
