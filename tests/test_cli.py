@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
-from helpers.commands import BALANCED, refused, run, write_half
+from helpers.commands import BALANCED, BOX, refused, run, write_half
 from helpers.onnx_models import NCHW, sum_of
 
 from selfcorrect import Settings, cli, exr
@@ -26,10 +26,7 @@ FAST = [
     "--window",
     "5",
     *PAPER,
-    "--denoiser",
-    "box",
-    "--threads",
-    "1",
+    *BOX,
 ]
 
 

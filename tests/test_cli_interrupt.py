@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.commands import refused, run
+from helpers.commands import BOX, refused, run
 
 from selfcorrect import cli
 
@@ -24,10 +24,7 @@ ENDLESS = [
     "1",
     "--window",
     "5",
-    "--denoiser",
-    "box",
-    "--threads",
-    "1",
+    *BOX,
 ]
 
 

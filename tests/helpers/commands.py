@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-BALANCED = ["--steps", "4", "--patch", "16", "--batch", "2", "--window", "5", "--denoiser", "box", "--threads", "1"]
+BOX = ["--denoiser", "box", "--threads", "1"]
+BALANCED = ["--steps", "4", "--patch", "16", "--batch", "2", "--window", "5", *BOX]
 
 
 def write_half(path: Path, seed: int, size: tuple[int, int] = (24, 30), **extra: Any) -> Path:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers.commands import write_half
+from helpers.commands import BOX, write_half
 
 FAST = [
     "--steps",
@@ -17,10 +17,7 @@ FAST = [
     "2",
     "--window",
     "5",
-    "--denoiser",
-    "box",
-    "--threads",
-    "1",
+    *BOX,
 ]
 LAST = 5
 Run = Callable[..., tuple[int, str, list[dict[str, Any]]]]
