@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from denoisers.nlm import Pair, half_variance
+from selfcorrect.image.windows import gaussian_mean
 from selfcorrect.kernel.nlm import non_local_means, strips
 from selfcorrect.kernel.regression import regress_non_local
-from selfcorrect.windows import gaussian_mean
 
 __all__ = ["Nfor"]
 

@@ -9,8 +9,8 @@ them is that its variance is smoothed over some pixels.
 import torch
 from torch import Tensor
 
+from selfcorrect.image.windows import gaussian_mean
 from selfcorrect.kernel.nlm import non_local_means
-from selfcorrect.windows import gaussian_mean
 
 __all__ = ["NonLocalMeans", "half_variance"]
 

@@ -3,9 +3,9 @@
 from selfcorrect.correct import Result, correct
 from selfcorrect.errors import SelfcorrectError
 from selfcorrect.frame import Frame
-from selfcorrect.sequence import correct_sequence
 from selfcorrect.settings import Settings
-from selfcorrect.state import State, load_state, save_state
+from selfcorrect.shot.sequence import correct_sequence
+from selfcorrect.shot.state import State, load_state, save_state
 
 __all__ = [
     "Frame",

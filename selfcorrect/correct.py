@@ -8,17 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from selfcorrect.bands import average, tile_means
-from selfcorrect.core import Start, inferred, trained
 from selfcorrect.errors import FrameError
-from selfcorrect.exposure import Scaled, scaled
 from selfcorrect.frame import Frame, mean
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light
-from selfcorrect.network import Network
+from selfcorrect.image.bands import average, tile_means
+from selfcorrect.image.exposure import Scaled, scaled
 from selfcorrect.settings import Settings
 from selfcorrect.stages import steps, weights
+from selfcorrect.stages.core.network import Network
+from selfcorrect.stages.core.stage import Start, inferred, trained
+from selfcorrect.stages.core.train import Progress
 from selfcorrect.stages.steps import StageImages, SubImage
-from selfcorrect.train import Progress
 
 __all__ = ["Result", "Start", "correct"]
 

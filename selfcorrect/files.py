@@ -174,7 +174,7 @@ class Images:
     """
 
     images: tuple[Tensor, ...]
-    source: exr.Half
+    source: exr.HalfFile
 
 
 def load_images(paths: Sequence[str]) -> Images:

@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from selfcorrect.bands import bands
 from selfcorrect.errors import FrameError
+from selfcorrect.image.bands import bands
 
 __all__ = ["Frame", "Half", "Repairs", "mean", "repaired"]
 

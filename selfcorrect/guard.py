@@ -10,47 +10,33 @@ firefly in the witness can turn its sign. So the evidence is pooled from coarse 
 tiles of 128, 64, 32 and 16 pixels. Each level starts from what the level above found, moves as far as its own evidence
 is certain, and then takes off one standard error.
 
-The image is gone through in bands of rows (:mod:`selfcorrect.bands`): only n and d are kept for every pixel, the rest
-as means over tiles of 16 pixels. Standard errors are taken over these tiles: evidence inside one may be correlated.
+The image is gone through in bands of rows (:mod:`selfcorrect.image.bands`): only n and d are kept for every pixel,
+the rest as means over tiles of 16 pixels. Standard errors are taken over these tiles: evidence inside one may be
+correlated.
 
-Measured with `scripts/bench_quality.py`; README has the numbers.
+Measured with `scripts/bench/quality.py`; README has the numbers.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from selfcorrect.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
+from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
+from selfcorrect.image.exposure import Radiance
 
-__all__ = ["Estimate", "Evidence", "Guarded", "Radiance", "guard", "keep_light", "trust_in_full"]
+__all__ = ["Estimate", "Evidence", "Guarded", "guard", "keep_light"]
 
 _LEVELS = (128, 64, 32, 16)  # sides of the tiles
 _PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
 _LARGEST_SCALE = 1.02  # of the whole image, to keep its light
-_DISAGREEMENT = 0.5  # (max − min) / (max + min) of the denoised halves: one of them has left a firefly
 _BIAS_SHRINKS = 0.45  # how much of the denoiser's change with the noise is taken for a change of its bias
-
-
-class Radiance(Protocol):
-    """An image (H, W, 3) that is read a band of rows at a time: a tensor, or something that is made when it is read."""
-
-    @property
-    def shape(self) -> torch.Size:
-        """(H, W, 3)."""
-        ...
-
-    def __getitem__(self, rows: Any, /) -> Tensor:
-        """These rows."""
-        ...
-
 
 Pair = tuple[Radiance, Radiance]
 
@@ -292,23 +278,6 @@ def _standard_error(tiles: Tensor) -> float:
     if tiles.numel() == 1:
         return float(tiles.abs())
     return float(tiles.std()) / math.sqrt(tiles.numel())
-
-
-def trust_in_full(denoised: Pair, denoised_full: Radiance, rows: slice) -> Tensor:
-    """How far the full buffer's denoised image may stand in for the halves' own, (rows, W, 1), 0 … 1.
-
-    It is the better input, but a firefly that the denoiser has left in one half is in the full buffer too; with their
-    own images only one of the corrected halves has it. So not where the halves differ by more than a factor of three,
-    unless the full buffer sides with the darker one.
-    """
-    wide, inner = widened(rows, 4, denoised_full.shape[0])
-    a, b, full = (image[wide].double().mean(-1) for image in (*denoised, denoised_full))
-    middle, half = (a + b) / 2, (a - b).abs() / 2
-    left_in_one = half > _DISAGREEMENT * middle.clamp(min=_DARKEST / 10)
-    sides_with_darker = (2 * (middle - full) / half.clamp(min=torch.finfo(torch.float64).tiny)).clamp(0, 1)
-    doubt = torch.where(left_in_one, 1 - sides_with_darker, 0.0)[None, None]
-    around = F.max_pool2d(doubt, 5, 1, 2)
-    return 1 - F.avg_pool2d(around, 5, 1, 2, count_include_pad=False)[0, 0, inner, :, None]
 
 
 def keep_light(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:

@@ -9,10 +9,10 @@ from selfcorrect.errors import SettingsError
 __all__ = ["Settings"]
 
 _PAPER = "Back et al. 2022"
-_OURS = "not in the paper; scripts/bench_quality.py measures it"
-_WARM = "not in the paper; scripts/bench_shot.py measures it"
+_OURS = "not in the paper; scripts/bench/quality.py measures it"
+_WARM = "not in the paper; scripts/bench/shot.py measures it"
 _TRAINED = "the package's own are trained by scripts/train"
-_STAGES = "not in the paper; scripts/bench_stages.py measures it"
+_STAGES = "not in the paper; scripts/bench/stages.py measures it"
 
 
 def _setting(
@@ -97,7 +97,7 @@ class Settings:
     visits: int = _setting(
         0,
         "how often steps may see a pixel on average: fewer steps on small frames; 0 sets no bound",
-        "not in the paper; scripts/bench_small_frames.py measures it",
+        "not in the paper; scripts/bench/small_frames.py measures it",
     )
     warm_steps: int = _setting(0, "steps of a frame that starts warm, at most those of any frame; 0 takes those", _WARM)
     learning_rate: float = _setting(0.01, "Adam's rate", f"{_PAPER}, published code")
@@ -162,7 +162,7 @@ class Settings:
         """Every preset by its name; the first is the default.
 
         ``paper`` is Back et al. 2022 as published. The others are points of the trade of speed for accuracy that
-        `scripts/bench_tradeoff.py` measures: README has its table.
+        `scripts/bench/tradeoff.py` measures: README has its table.
         """
         balanced = cls(
             patch=64,

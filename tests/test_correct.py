@@ -216,7 +216,7 @@ def test_a_real_frame_gets_better(shared: Path) -> None:
 
 @pytest.mark.shared
 def test_next_frame_of_a_shot_starts_warm_and_another_scene_cold(shared: Path) -> None:
-    """Real frames, a part of each to be quick; scripts/bench_shot.py measures what the warm start gains."""
+    """Real frames, a part of each to be quick; scripts/bench/shot.py measures what the warm start gains."""
 
     def load(name: str, halves: str) -> Frame:
         a, b = (exr.load_half(shared / name.format(half)).buffers for half in halves)

@@ -4,9 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from selfcorrect import bands
-from selfcorrect.guard import Evidence, Guarded, Pair, keep_light, trust_in_full
+from selfcorrect.guard import Evidence, Guarded, Pair, keep_light
 from selfcorrect.guard import guard as guard_by_evidence
+from selfcorrect.image import bands
+from selfcorrect.stages.core.trust import trust_in_full
 
 SIZE = (160, 192)
 

@@ -28,12 +28,12 @@ import denoisers
 from selfcorrect import Frame, Settings, correct, metrics
 from selfcorrect.errors import FileError
 from selfcorrect.frame import mean
-from selfcorrect.network import Network
 from selfcorrect.stages import weights
+from selfcorrect.stages.core.network import Network
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the other scripts
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
 
-from bench_quality import load as load_frame
+from quality import load as load_frame
 
 DENOISERS = ("oidn", "joint-bilateral", "nfor", "onnx")
 STAGES = (

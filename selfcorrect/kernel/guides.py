@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-__all__ = ["LARGEST", "Guides", "mirror"]
+from selfcorrect.image.exposure import LARGEST
 
-LARGEST = 1e15  # keeps squared differences in the window finite in float32
+__all__ = ["Guides", "mirror"]
+
 _LANES = 16  # the widest vector reads up to this many pixels beyond the last one
 
 

@@ -10,9 +10,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from selfcorrect.image.windows import reflected
 from selfcorrect.stages.layers import convolution, start_flat, tau
 from selfcorrect.stages.taps import windowed_sum
-from selfcorrect.windows import reflected
 
 __all__ = ["DeepCombiner", "combined", "feature_planes"]
 

@@ -9,14 +9,14 @@ That promise is one of equal noise in all pixels of a block. Monte Carlo noise g
 block sums an inverted image made some frames 10 % worse (dining-room, 256 spp), as the noise of bright pixels let dark
 ones go. So :func:`james_stein` takes a weight of each pixel; with :func:`relative_weight` both the noise becomes nearly
 even and the squared error the relative one, and no frame, sample count or biased image was found that it makes
-worse (``scripts/bench_stages.py dominance``).
+worse (``scripts/bench/stages.py dominance``).
 """
 
 import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
-from selfcorrect.windows import box_mean, gaussian_mean
+from selfcorrect.image.windows import box_mean, gaussian_mean
 
 __all__ = ["WINDOW", "james_stein", "relative_weight", "variance_of_mean"]
 

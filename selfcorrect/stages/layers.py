@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from selfcorrect.windows import reflect
+from selfcorrect.image.windows import reflect
 
 __all__ = ["convolution", "start_flat", "tau", "to_multiple"]
 

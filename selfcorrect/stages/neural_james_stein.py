@@ -10,10 +10,10 @@ weight of the classical variant here, too. With equal weights and α = ½ the tw
 import torch
 from torch import Tensor, nn
 
+from selfcorrect.image.windows import box_mean, reflected
 from selfcorrect.stages.james_stein import WINDOW, relative_weight
 from selfcorrect.stages.layers import convolution, start_flat, tau, to_multiple
 from selfcorrect.stages.taps import windowed_sum
-from selfcorrect.windows import box_mean, reflected
 
 __all__ = [
     "ALIGNMENT",

@@ -19,7 +19,7 @@ from selfcorrect.kernel.regression import regress
 __all__ = ["RIDGE", "STRIDE", "WINDOW", "bandwidth", "cross_buffer_regression", "own_buffer_regression"]
 
 WINDOW = 51
-RIDGE = 1e-4  # of features scaled to at most 1 and weights of sum 1; measured by scripts/bench_stages.py
+RIDGE = 1e-4  # of features scaled to at most 1 and weights of sum 1; measured by scripts/bench/stages.py
 STRIDE = 1
 EPSILON = 0.01  # added to the bandwidth, as published
 

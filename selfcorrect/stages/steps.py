@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from selfcorrect.exposure import Scaled, scaled
 from selfcorrect.frame import Half, mean
+from selfcorrect.image.exposure import Scaled, scaled
 from selfcorrect.settings import Settings
 from selfcorrect.stages import james_stein as js
 from selfcorrect.stages import regression, tiled, weights

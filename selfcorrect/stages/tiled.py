@@ -13,9 +13,9 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
-from selfcorrect.exposure import scaled
-from selfcorrect.infer import Region, tiles
-from selfcorrect.kernel import LARGEST
+from selfcorrect.image.exposure import LARGEST, scaled
+from selfcorrect.image.tiles import Region, tiles
+from selfcorrect.image.windows import reflect
 from selfcorrect.kernel.convolution import best_instruction_set
 from selfcorrect.stages.deep_combiner import DeepCombiner, combined
 from selfcorrect.stages.james_stein import WINDOW
@@ -27,11 +27,10 @@ from selfcorrect.stages.neural_james_stein import (
     shrunk,
     smoothed_variance,
 )
-from selfcorrect.windows import reflect
 
-__all__ = ["TILE", "combine", "cut", "neural_james_stein"]
+__all__ = ["SIDE", "combine", "cut", "neural_james_stein"]
 
-TILE = 192  # pixels; the weights of the taps of a tile, four buffers and what lies around are 0.2 GB in float32
+SIDE = 192  # of the tiles, pixels; the weights of a tile, four buffers and what lies around are 0.2 GB
 
 
 @torch.no_grad()
@@ -43,7 +42,7 @@ def combine(
     *,
     scale: float = 1.0,
     precision: str = "fp32",
-    side: int = TILE,
+    side: int = SIDE,
 ) -> Tensor:
     """The deep combiner's image, (H, W, 3).
 
@@ -83,7 +82,7 @@ def neural_james_stein(
     y_b: Tensor,
     *,
     precision: str = "fp32",
-    side: int = TILE,
+    side: int = SIDE,
 ) -> Tensor:
     """θ of the neural James–Stein combiner, (H, W, 3); arguments as for its network and :func:`combine`.
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
-from selfcorrect.windows import box_mean, reflected
+from selfcorrect.image.windows import box_mean, reflected
 
 __all__ = ["GAMMAS", "KERNELS", "WINDOW", "combine"]
 

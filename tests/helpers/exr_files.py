@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 
-from selfcorrect import exr, exrheader
+from selfcorrect import exr
+from selfcorrect.exr import header as exrheader
 
 HEIGHT, WIDTH = 9, 14
 SIZE = (HEIGHT, WIDTH)

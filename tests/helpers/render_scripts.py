@@ -1,5 +1,6 @@
 """The scripts that render the two halves, each with the Python that has its renderer."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -26,7 +27,7 @@ def refused(name: str, *arguments: object) -> str:
     """The one line of an error that the user can mend."""
     result = script(name, *arguments)
     assert result.returncode == 2, result.stderr
-    lines = [line for line in result.stderr.splitlines() if f"{name}: error: " in line or f"{name}.py: error: " in line]
+    lines = [line for line in result.stderr.splitlines() if re.search(rf"{Path(name).name}(\.py)?: error: ", line)]
     assert len(lines) == 1, result.stderr
     assert "Traceback" not in result.stderr
     return lines[0]

@@ -1,0 +1,91 @@
+"""A shot, cold against warm: error of each frame against two references, seconds, flicker.
+
+    .venv/bin/python scripts/bench/shot.py ../shared/shot [--preset balanced] [--variants cold warm warm:steps=50 key]
+
+Variants: ``cold`` (each frame on its own), ``warm`` (each from the last one's network, with the preset's settings for
+that), ``key`` (each from the first frame's network), and any of them with settings changed: ``warm:warm_steps=50``,
+commas between several. Prints relMSE of noisy, denoised and each variant for every frame, with the mean radiance over
+that of the smooth reference, the mean over the frames after the first (which is cold in any case), and the temporal
+error (:func:`selfcorrect.metrics.temporal_error`), the mean over all pairs of neighbours.
+"""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import denoisers
+from selfcorrect import Frame, Settings, correct, exr, metrics
+
+ROLES = ("color", "albedo", "normal", "visibility", "depth")
+
+
+def load(folder: Path, number: int, denoiser: str, threads: int) -> tuple[Frame, list[np.ndarray]]:
+    """A denoised frame and its references: two independent ones, and the smooth one."""
+
+    def file(kind: str) -> Path:
+        shot = next(folder.glob("*_ref_smooth.*.exr")).name.partition("_ref_smooth")[0]
+        return folder / f"{shot}_{kind}.{number:04d}.exr"
+
+    a, b = (exr.load_half(file(half)).buffers for half in "ab")
+    references = [exr.load_half(file(f"ref_{r}")).buffers["color"] for r in ("a", "b", "smooth")]
+    frame = Frame(**{role: (a[role], b[role]) for role in ROLES if role in a})
+    return frame.denoise(denoisers.create(denoiser, threads=threads)), references
+
+
+def corrected(frames: list[Frame], preset: str, variant: str) -> tuple[list[Any], list[float]]:
+    """Images of one variant, and seconds of each."""
+    how, _, changes = variant.partition(":")
+    pairs = dict(change.split("=") for change in changes.split(",") if change)
+    settings = Settings.preset(preset, **{k: int(v) if v.isdigit() else float(v) for k, v in pairs.items()})
+    images, seconds, last, first = [], [], None, None
+    for frame in frames:
+        start = time.process_time()
+        result = correct(frame, settings, warm_start={"cold": None, "warm": last, "key": first}[how])
+        last, first = result.network, first or result.network
+        images.append(result.image)
+        seconds.append(time.process_time() - start)
+    return images, seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--preset", default=Settings.default())
+    parser.add_argument("--denoiser", default="oidn")
+    parser.add_argument("--variants", nargs="*", default=["cold", "warm"])
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    numbers = sorted(int(p.name.split(".")[-2]) for p in options.folder.glob("*_ref_smooth.*.exr"))
+    loaded = [load(options.folder, number, options.denoiser, options.threads) for number in numbers]
+    frames, references = [frame for frame, _ in loaded], [reference for _, reference in loaded]
+    print(f"preset {options.preset}, denoiser {options.denoiser}: relMSE (mean radiance) of each frame; CPU seconds")
+    print(f"| | {' | '.join(map(str, numbers))} | after the first | temporal | seconds |")
+    print(f"|---|{'---|' * (len(numbers) + 3)}")
+    row("noisy", [np.asarray((f.color[0] + f.color[1]) / 2) for f in frames], references, [0.0])
+    row(options.denoiser, [f.denoised_full for f in frames], references, [0.0])
+    for variant in options.variants:
+        images, seconds = corrected(frames, options.preset, variant)
+        row(variant, images, references, seconds[1:])
+
+
+def row(name: str, images: list[Any], references: list[list[np.ndarray]], seconds: list[float]) -> None:
+    """Print one row of the table."""
+    errors = [metrics.relmse(image, *reference) for image, reference in zip(images, references, strict=True)]
+    means = [metrics.mean_radiance_ratio(image, r[2]) for image, r in zip(images, references, strict=True)]
+    flicker = []
+    for t in range(1, len(images)):
+        pairs = [(references[t][i], references[t - 1][i]) for i in range(3)]
+        flicker.append(metrics.temporal_error(images[t], images[t - 1], *pairs))
+    each = " | ".join(f"{error:.5f} ({mean:.3f})" for error, mean in zip(errors, means, strict=True))
+    print(
+        f"| {name} | {each} | {np.mean(errors[1:]):.5f} | {np.mean(flicker):.5f} | {np.mean(seconds):.1f} |", flush=True
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""The command `bench`: what each second buys on the user's own frame, judged without a reference."""
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from selfcorrect import exr, files, tradeoff
+from selfcorrect.cli.runner import Runner, add_halves, add_run_flags, answer, log, mapping
+from selfcorrect.errors import SettingsError
+from selfcorrect.frame import Frame
+from selfcorrect.publish import publish
+from selfcorrect.settings import Settings
+from selfcorrect.tradeoff import Measurement, Point
+
+__all__ = ["add"]
+
+_ERROR = "estimated relMSE over that of the denoised image"
+
+
+def add(commands: Any) -> None:
+    """Add the command to argparse's subparsers."""
+    parser = commands.add_parser("bench", help="what each second buys on this frame, and the preset to take")
+    add_halves(parser)
+    parser.add_argument(
+        "--points",
+        nargs="+",
+        action="extend",
+        metavar="POINT",
+        help="try these: presets, base (the settings given), SETTING=VALUE,…, PRESET:SETTING=VALUE,…",
+    )
+    parser.add_argument(
+        "--previous", nargs=2, metavar=("A.exr", "B.exr"), help="the frame before: also try a warm start from it"
+    )
+    parser.add_argument("--csv", metavar="OUT.csv", help="keep the measurements here, after each point")
+    parser.add_argument("--plot", metavar="OUT.png", help="seconds against error (needs the extra bench)")
+    add_run_flags(parser)
+    parser.set_defaults(run=_bench)
+
+
+def _bench(options: argparse.Namespace) -> None:
+    if options.aov:
+        raise SettingsError("expected no --aov with bench, which writes no image, but got one")
+    if options.guard is False:
+        raise SettingsError("expected the guard, whose estimate bench compares, but got --no-guard")
+    runner = Runner(options, given=options.denoised_a is not None and options.previous is None)
+    table, picture = (
+        None if path is None else exr.check_target(path, suffix)
+        for path, suffix in ((options.csv, ".csv"), (options.plot, ".png"))
+    )
+    if picture is not None:
+        tradeoff.figure_class()  # what is missing is to be known before the work
+    points = _points(options, replace(runner.settings, guard=True))
+    frame = _frame(options, runner, (options.a, options.b), given=True)
+    previous = None if options.previous is None else _frame(options, runner, options.previous, given=False)
+    measured: list[Measurement] = []
+    try:
+        for one in tradeoff.sweep(frame, points, previous=previous):
+            measured.append(one)
+            log(f"{len(measured)} of {len(points)}: {_told(one)}")
+            if table is not None:
+                publish(table, tradeoff.table(measured))
+    finally:  # also after Ctrl-C: what was measured is worth its minutes
+        if measured:
+            _answer(options, frame, measured)
+    if picture is not None:
+        publish(picture, tradeoff.plot(measured, _ERROR, title=f"{frame.size[1]}x{frame.size[0]} pixels"))
+
+
+def _points(options: argparse.Namespace, base: Settings) -> list[Point]:
+    if options.points is None:
+        return tradeoff.points(base, guarded=True, warm=options.previous is not None)
+    chosen = [tradeoff.point(name, base, guarded=True) for name in options.points]
+    if options.previous is None and any(p.warm for p in chosen):
+        raise SettingsError("expected --previous A.exr B.exr with the point warm, but got none")
+    return chosen
+
+
+def _frame(options: argparse.Namespace, runner: Runner, halves: Sequence[str], *, given: bool) -> Frame:
+    """A frame with its denoised halves; ``given``: those of the flags, where there are any."""
+    names = ("denoised_a", "denoised_b", "denoised") if given else ()
+    denoised = {name: getattr(options, name) for name in names}
+    start = time.perf_counter()
+    loaded = files.load(files.Sources(halves[0], halves[1], **denoised, mapping=mapping(options)))
+    frame, denoiser = runner.prepare(loaded, {})
+    log(f"read and denoised ({denoiser}) in {time.perf_counter() - start:.1f} s")
+    return frame.to(options.device)
+
+
+def _told(m: Measurement) -> str:
+    cold = ", started cold: it does not look like the frame before" if m.point.warm and not m.started_warm else ""
+    return f"{m.point.name}: {m.ratio:.3f} ± {m.standard_error:.3f} in {m.seconds:.2f} s{cold}"
+
+
+def _answer(options: argparse.Namespace, frame: Frame, measured: list[Measurement]) -> None:
+    """The table and the recommendation, on stdout."""
+    front, chosen = tradeoff.pareto_front(measured), tradeoff.recommended(measured)
+    if options.json:
+        height, width = frame.size
+        answer(
+            {
+                "size": {"width": width, "height": height},
+                "points": [_plain(m) for m in measured],
+                "front": [m.point.name for m in front],
+                "recommended": None if chosen is None else chosen.point.name,
+            }
+        )
+        return
+    print(f"{'point':24} {'train':>8} {'infer':>8} {'seconds':>8}  {_ERROR}; * on the Pareto front")
+    for m in measured:
+        mark = " *" if m in front else ""
+        print(
+            f"{m.point.name:24} {m.train:8.2f} {m.infer:8.2f} {m.seconds:8.2f}  "
+            f"{m.ratio:.3f} ± {m.standard_error:.3f}{mark}"
+        )
+    print(_recommendation(measured, chosen), flush=True)
+
+
+def _recommendation(measured: list[Measurement], chosen: Measurement | None) -> str:
+    if chosen is None:
+        return "no preset was among the points: none is recommended"
+    best = min((m for m in measured if m.point.preset), key=lambda m: m.ratio)
+    if best.ratio >= 1:
+        return "the evidence shows no gain by any preset on this frame: keep the denoised image"
+    line = f"recommended: --preset {chosen.point.name} ({100 * (chosen.ratio - 1):+.0f} % in {chosen.seconds:.1f} s"
+    if best is chosen:
+        return f"{line}: the best preset here)"
+    return f"{line}; {best.point.name}: {100 * (best.ratio - 1):+.0f} % in {best.seconds:.1f} s)"
+
+
+def _plain(m: Measurement) -> dict[str, Any]:
+    return {
+        "point": m.point.name,
+        "settings": m.point.settings.to_dict(),
+        "preset": m.point.preset,
+        "warm": m.started_warm,
+        "ratio": m.ratio,
+        "standard_error": m.standard_error,
+        "train": round(m.train, 3),
+        "infer": round(m.infer, 3),
+    }

@@ -1,0 +1,114 @@
+"""How much memory a frame takes, known from the headers of its files before anything is read.
+
+What is counted is what is held for every pixel; `tests/test_memory.py` holds it against the peak of the real command.
+"""
+
+import math
+import re
+from typing import NamedTuple
+
+import torch
+
+from selfcorrect.errors import SettingsError
+from selfcorrect.exr import channels
+from selfcorrect.exr.file import headers
+from selfcorrect.exr.header import Header
+from selfcorrect.files import Sources
+from selfcorrect.settings import Settings
+from selfcorrect.stages.core.patches import crops
+
+__all__ = ["Needs", "needs", "parse_size", "scratch_within"]
+
+GIB = 2**30
+_BASE = 0.35 * GIB  # the interpreter, torch, the OpenEXR library and OIDN's weights
+_WORK = 0.6 * GIB  # one strip of tiles in every form, the network's for one batch, and what the allocator keeps
+_OIDN = 0.2 * GIB  # its weights and buffers beside the scratch that it is told of
+_LEAST_SCRATCH = 0.4 * GIB  # its smallest tile takes 0.34 GiB
+_BYTES = {0: 4, 1: 2, 2: 4}  # uint, half, float
+_RGB = 12  # bytes of a pixel of three float32 channels
+_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+
+
+class Needs(NamedTuple):
+    """Peak bytes of each stage; that of denoising without what OIDN takes beside its images."""
+
+    read: float
+    denoise: float
+    correct: float
+    write: float
+
+
+def parse_size(text: str) -> int:
+    """Bytes of a size such as 6G, 5.5G or 800M (binary units).
+
+    >>> parse_size("1.5G") // 2**20
+    1536
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    if found is None:
+        raise SettingsError(f"expected a size such as 6G or 800M, but got {text!r}")
+    return int(float(found[1]) * _UNITS[found[2].upper()])
+
+
+def scratch_within(limit: int, sources: Sources, settings: Settings) -> int:
+    """Bytes that are left for OIDN beside its images.
+
+    Raises:
+        FileError: half a cannot be read.
+        SettingsError: the frame does not fit.
+    """
+    found = needs(sources, settings)
+    needed = dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
+    stage = max(needed, key=lambda name: needed[name])
+    if needed[stage] > limit:
+        least = math.ceil(10 * needed[stage] / GIB) / 10
+        raise SettingsError(
+            f"{sources.a}: expected --maxmem of at least {least:.1f}G for a frame of this size and these channels "
+            f"(most of it to {stage}), but got {limit / GIB:.1f}G"
+        )
+    return int(limit - found.denoise - _OIDN)
+
+
+def needs(sources: Sources, settings: Settings) -> Needs:
+    """What a frame needs, by the header of half a; both halves are taken to be alike."""
+    file, _, layer = sources.a.partition("::")
+    parts, stored = headers(file)
+    height, width = parts[0].data_window.size
+    pixels = height * width
+    held = pixels * sum(_BYTES[channel.type] for part in parts for channel in part.channels)
+    features = _features(sources, parts, layer or None)
+    half = pixels * (_RGB + sum(features.values()))
+    image = pixels * _RGB
+    aids = image * len(features.keys() & {"albedo", "normal"})
+    planes = 2 + len(features.keys() & {"albedo", "normal"}) + ("visibility" in features) / 3
+    trained = sum((b - t) * (r - x) for t, x, b, r in crops((height, width), settings, torch.Generator())) or pixels
+    training = 1.2 * trained * 2 * (planes * _RGB + 4)  # 1.2: margins
+    sub_images = len(sources.sub_images) * image
+    evidence = pixels * 16 if settings.guard else 0
+    return Needs(
+        read=_BASE + half + held + max(stored, half) + sub_images,
+        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * sub_images,
+        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * sub_images,
+        write=_BASE + _WORK + 2 * image + held + max(stored, held),
+    )
+
+
+def _features(sources: Sources, parts: list[Header], layer: str | None) -> dict[str, int]:
+    """Bytes of a pixel of each G-buffer of one half."""
+    file = sources.a.partition("::")[0]
+    named = [(_name(part), [channel.name for channel in part.channels]) for part in parts]
+    full = [name for names in channels.full_names(named) for name in names]
+    types = dict(zip(full, (channel.type for part in parts for channel in part.channels), strict=True))
+    taken = channels.choose(full, file=file, layer=layer, mapping=sources.mapping)
+    found = {
+        role: len(names) * max(_BYTES[types[name]] for name in names)
+        for role, names in taken.items()
+        if role not in ("color", "alpha", "denoised")
+    }
+    beside = {role: _RGB for role in channels.siblings(file) if role not in found}
+    return found | {role: size for role, size in beside.items() if role in ("albedo", "normal", "visibility", "depth")}
+
+
+def _name(part: Header) -> str:
+    attribute = part.attributes.get("name")
+    return "" if attribute is None else attribute.data.decode("utf-8", "replace")

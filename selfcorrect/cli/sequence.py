@@ -1,0 +1,96 @@
+"""The command `sequence`: the frames of a shot, from files to files."""
+
+import argparse
+from functools import partial
+from typing import Any
+
+from selfcorrect.cli.runner import Runner, add_run_flags, answer, log, mapping
+from selfcorrect.correct import Start
+from selfcorrect.errors import FrameError
+from selfcorrect.settings import Settings
+from selfcorrect.shot import run as shot
+from selfcorrect.shot.framerange import parse_frames
+from selfcorrect.shot.sequence import follows
+from selfcorrect.shot.state import load_state
+from selfcorrect.stages.core.network import Network
+
+__all__ = ["add"]
+
+
+def add(commands: Any) -> None:
+    """Add the command to argparse's subparsers."""
+    parser = commands.add_parser("sequence", help="correct the frames of a shot, each from the last one's network")
+    parser.add_argument("a", metavar="A.####.exr", help="half a; #### or %%04d stands for the frame number")
+    parser.add_argument("b", metavar="B.####.exr", help="half b, rendered with another seed")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.####.exr")
+    parser.add_argument("--frames", required=True, metavar="RANGE", help="1-240, 1-240x2, 1-3,5,7-20:2, …")
+    parser.add_argument("--denoised-a", metavar="DA.####.exr", help="denoised half a, instead of a denoiser")
+    parser.add_argument("--denoised-b", metavar="DB.####.exr")
+    parser.add_argument("--denoised-full", metavar="D.####.exr", help="denoised mean of both halves")
+    parser.add_argument(
+        "--skip-existing", action="store_true", help="leave out frames whose output is whole and made the same way"
+    )
+    parser.add_argument("--cold", action="store_true", help="no frame starts from the one before")
+    parser.add_argument("--warm-start", metavar="STATE", help="state that the first frame starts from")
+    parser.add_argument(
+        "--save-state", metavar="STATE.safetensors", help="keep the last frame's state here; with ####, that of each"
+    )
+    parser.add_argument("--fail-fast", action="store_true", help="end with the first frame that fails")
+    add_run_flags(parser)
+    parser.set_defaults(run=_sequence)
+
+
+def _sequence(options: argparse.Namespace) -> int:
+    """Returns how many frames failed."""
+    names = {"denoised_a": options.denoised_a, "denoised_b": options.denoised_b, "denoised": options.denoised_full}
+    frames = parse_frames(options.frames)
+    work = shot.Shot(options.a, options.b, options.output, frames, **names, mapping=mapping(options))
+    runner = Runner(options, given=options.denoised_a is not None)
+    given = None if options.warm_start is None else _given(options.warm_start, runner.settings)
+    habits = shot.Habits(
+        runner.settings,
+        {"denoiser": runner.denoiser, "aov": options.aov},
+        skip_existing=options.skip_existing,
+        cold=options.cold,
+        warm_start=given,
+        save_state=options.save_state,
+        fail_fast=options.fail_fast,
+    )
+
+    def one(job: shot.Job) -> shot.Done:
+        network = job.network
+        if network is not None and network is not given and not follows(network, job.loaded.frame):
+            log(f"frame {job.frame}: other buffers than the frame before: starts cold")
+            network = None
+        corrected = runner.correct(job.loaded, network, job.meanwhile)
+        log(f"frame {job.frame}: {_started(corrected.result.start)}")
+        more = {"frame": job.frame, "recipe": job.recipe}
+        return shot.Done(corrected.result.network, partial(runner.write, job.output, corrected, more))
+
+    def report(outcome: shot.Outcome) -> None:
+        if outcome.kind != "written":
+            log(f"frame {outcome.frame}: {outcome.kind}: {outcome.reason or outcome.output}")
+        if options.json:
+            told = outcome.report or {"output": outcome.output, "reason": outcome.reason}
+            answer({"frame": outcome.frame, "outcome": outcome.kind, **told})
+
+    failed = shot.run(work, habits, one, report, log)
+    if failed:
+        log(f"selfcorrect: {failed} of {len(frames)} frames failed")
+    return failed
+
+
+def _given(path: str, settings: Settings) -> Network:
+    network = load_state(path).network
+    try:
+        network.traits.check_settings(settings)
+    except FrameError as error:
+        raise FrameError(f"{path}: {error}") from None
+    return network
+
+
+def _started(start: Start) -> str:
+    if start.warm_loss is None:
+        return "started cold"
+    how = "started warm" if start.warm else "did not look like the frame before: started cold"
+    return f"{how} (loss before training {start.warm_loss:.5g} warm, {start.cold_loss:.5g} cold)"

@@ -1,0 +1,8 @@
+"""Layered OpenEXR files in and out: halves to correct come in, everything but the colour passes through."""
+
+from selfcorrect.exr.file import ExrFile, read
+from selfcorrect.exr.inspection import Inspection, inspect
+from selfcorrect.exr.load import HalfFile, load_half
+from selfcorrect.exr.write import check_target, write
+
+__all__ = ["ExrFile", "HalfFile", "Inspection", "check_target", "inspect", "load_half", "read", "write"]

@@ -1,0 +1,131 @@
+"""What an OpenEXR file holds, and which of its channels would be used for what."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from selfcorrect.errors import ChannelError
+from selfcorrect.exr import channels
+from selfcorrect.exr.file import Pixels, read
+from selfcorrect.exr.header import Window
+
+__all__ = ["ChannelReport", "Inspection", "PartReport", "inspect"]
+
+
+@dataclass(frozen=True)
+class ChannelReport:
+    """One channel: full name, type, count of NaN and of infinite pixels, and the range of the finite ones."""
+
+    name: str
+    dtype: str
+    nan: int
+    inf: int
+    minimum: float | None
+    maximum: float | None
+    mean: float | None
+
+    def line(self) -> str:
+        """Text for people."""
+        bad = "".join(f", {count} {kind}" for kind, count in (("NaN", self.nan), ("infinite", self.inf)) if count)
+        if self.mean is None:
+            return f"{self.name}: {self.dtype}, no finite pixel{bad}"
+        return f"{self.name}: {self.dtype}, {self.minimum:.6g} … {self.maximum:.6g}, mean {self.mean:.6g}{bad}"
+
+
+@dataclass(frozen=True)
+class PartReport:
+    """One part: its storage, windows and channels."""
+
+    name: str
+    storage: str
+    compression: str
+    data_window: Window
+    display_window: Window
+    channels: tuple[ChannelReport, ...]
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What a file holds and what would be taken from it.
+
+    Attributes:
+        path: the file.
+        parts: what it holds.
+        layers: the layers that hold colour; ``""`` stands for colour without a layer.
+        taken: role → channels that would be used; empty where there is no colour.
+        siblings: role → separate file that would be used.
+        problem: why nothing would be taken, or None.
+    """
+
+    path: str
+    parts: tuple[PartReport, ...]
+    layers: tuple[str, ...]
+    taken: dict[str, tuple[str, ...]]
+    siblings: dict[str, str]
+    problem: str | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; windows are ``[x_min, y_min, x_max, y_max]``."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Text for people, a line each for parts, channels and roles."""
+        text = [self.path]
+        for part in self.parts:
+            height, width = part.data_window.size
+            text.append(
+                f"part '{part.name}': {width}×{height} pixels, {part.storage}, {part.compression}, "
+                f"data window {tuple(part.data_window)}, display window {tuple(part.display_window)}"
+            )
+            text += [f"  {channel.line()}" for channel in part.channels]
+        if any(self.layers):
+            text.append("layers: " + ", ".join(layer or "(none)" for layer in self.layers))
+        text += [f"{role}: {', '.join(names)}" for role, names in self.taken.items()]
+        text += [f"{role}: {file}" for role, file in self.siblings.items()]
+        return text if self.problem is None else [*text, self.problem]
+
+
+def inspect(path: str | Path) -> Inspection:
+    """Say what a file holds and which channels would be used for what.
+
+    Args:
+        path: the file, or ``FILE.exr::LAYER``.
+
+    Raises:
+        FileError: the file cannot be read.
+    """
+    file = read(path)
+    names = file.channel_names
+    parts = []
+    for index, part in enumerate(file.parts):
+        reports = [_report(name, file.pixels(name)) for name in names if file.place(name)[0] == index]
+        parts.append(
+            PartReport(
+                part.name,
+                part.header["type"].name,
+                part.header["compression"].name.removesuffix("_COMPRESSION"),
+                part.data_window,
+                part.display_window,
+                tuple(reports),
+            )
+        )
+    taken, siblings, problem = {}, {}, None
+    try:
+        taken = channels.choose(names, file=file.path, layer=file.layer)
+        found = channels.siblings(file.path)
+        siblings = {role: str(sibling) for role, sibling in found.items() if role not in taken}
+    except ChannelError as error:
+        problem = str(error)
+    return Inspection(file.path, tuple(parts), tuple(channels.layers(names)), taken, siblings, problem)
+
+
+def _report(name: str, pixels: Pixels) -> ChannelReport:
+    finite = pixels[np.isfinite(pixels)].astype(np.float64)
+    nan = int(np.count_nonzero(np.isnan(pixels)))
+    inf = pixels.size - finite.size - nan
+    if not finite.size:
+        return ChannelReport(name, pixels.dtype.name, nan, inf, None, None, None)
+    span = float(finite.min()), float(finite.max()), float(finite.mean())
+    return ChannelReport(name, pixels.dtype.name, nan, inf, *span)

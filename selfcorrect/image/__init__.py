@@ -1,0 +1,1 @@
+"""Pieces of an image: bands of rows, windows, exposure."""

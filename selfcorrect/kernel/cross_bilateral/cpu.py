@@ -1,0 +1,114 @@
+"""The compiled kernel as differentiable torch functions."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from selfcorrect.kernel import _cpu
+from selfcorrect.kernel.guides import Guides
+
+__all__ = ["cross_bilateral", "cross_bilateral_loss", "instruction_sets"]
+
+
+def instruction_sets() -> list[str]:
+    """Names of the compiled variants that this processor can run, slowest first."""
+    return list(_cpu.instruction_sets())
+
+
+class _Options(NamedTuple):
+    window: int
+    every: int
+    combination: str
+    isa: str
+    threads: int
+
+
+def _arguments(guides: Guides, raw: Tensor, corners: Tensor, options: _Options) -> tuple[Any, ...]:
+    return (
+        guides.planes,
+        raw.detach(),
+        (corners + guides.margin).contiguous(),
+        options.window,
+        options.every,
+        guides.has_albedo,
+        guides.has_normal,
+        guides.has_visibility,
+        options.combination == "eq3",
+        options.isa or instruction_sets()[-1],
+        options.threads,
+    )
+
+
+class _CrossBilateral(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, guides: Guides, corners: Tensor, options: _Options) -> Tensor:
+        ctx.save_for_backward(raw)
+        ctx.call = (guides, corners, options)
+        output = raw.new_empty((raw.shape[0], 3, raw.shape[2], raw.shape[3]))
+        _cpu.forward(*_arguments(guides, raw, corners, options), output)
+        return output
+
+    @staticmethod
+    def backward(ctx: Any, *output_gradients: Tensor) -> Any:
+        (raw,) = ctx.saved_tensors
+        guides, corners, options = ctx.call
+        gradient = torch.empty_like(raw)
+        _cpu.backward(*_arguments(guides, raw, corners, options), output_gradients[0].contiguous(), gradient)
+        return gradient, None, None, None
+
+
+class _CrossBilateralLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, raw: Tensor, guides: Guides, corners: Tensor, target: Tensor, weight: Tensor, options: _Options
+    ) -> Tensor:
+        gradient = torch.empty_like(raw)
+        row_loss = torch.empty(raw.shape[0] * raw.shape[2], dtype=torch.float64)
+        _cpu.loss(*_arguments(guides, raw, corners, options), target, weight, gradient, row_loss)
+        count = raw.shape[0] * raw.shape[2] * raw.shape[3] * 3
+        ctx.save_for_backward(gradient)
+        ctx.count = count
+        return (row_loss.sum() / count).to(raw.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *output_gradients: Tensor) -> Any:
+        (gradient,) = ctx.saved_tensors
+        return gradient * (output_gradients[0] / ctx.count), None, None, None, None, None
+
+
+def cross_bilateral(
+    guides: Guides,
+    raw: Tensor,
+    corners: Tensor,
+    *,
+    window: int,
+    every: int,
+    combination: str,
+    threads: int,
+    isa: str = "",
+) -> Tensor:
+    """Eq. 10, like :func:`selfcorrect.kernel.cross_bilateral.reference.cross_bilateral`, for float32 on the CPU."""
+    options = _Options(window, every, combination, isa, threads)
+    apply: Callable[..., Tensor] = _CrossBilateral.apply  # torch leaves it untyped
+    return apply(raw, guides, corners, options)
+
+
+def cross_bilateral_loss(
+    guides: Guides,
+    raw: Tensor,
+    corners: Tensor,
+    target: Tensor,
+    weight: Tensor,
+    *,
+    window: int,
+    every: int,
+    combination: str,
+    threads: int,
+    isa: str = "",
+) -> Tensor:
+    """One half of Eq. 8, value and gradient in one visit of each pixel."""
+    options = _Options(window, every, combination, isa, threads)
+    apply: Callable[..., Tensor] = _CrossBilateralLoss.apply  # torch leaves it untyped
+    return apply(raw, guides, corners, target, weight, options)

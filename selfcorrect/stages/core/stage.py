@@ -1,0 +1,165 @@
+"""The stage that the project is named for: a network optimised on one frame, and what it makes of it."""
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from selfcorrect.frame import Half, mean
+from selfcorrect.image.bands import bands
+from selfcorrect.image.exposure import Scaled, scaled
+from selfcorrect.kernel.guides import Guides
+from selfcorrect.settings import Settings
+from selfcorrect.stages.core.infer import SIDE, infer, infer_tile
+from selfcorrect.stages.core.network import Network
+from selfcorrect.stages.core.patches import crops, overhang
+from selfcorrect.stages.core.train import Limits, Progress, starting_losses, train
+from selfcorrect.stages.core.trust import trust_in_full
+from selfcorrect.stages.steps import StageImages
+
+__all__ = ["Start", "Trained", "inferred", "trained"]
+
+Keep = Callable[[slice, tuple[Tensor, Tensor]], None]
+
+_TRIAL = 256  # side of the tile whose time is taken for the time budget
+_GUARD_SECONDS = 2e-6  # a pixel, with some to spare
+
+
+class Start(NamedTuple):
+    """What training began from.
+
+    Attributes:
+        warm: from the network that was given, not from a new one.
+        cold_loss: Eq. 8 of a new network on a sample of the frame; None where no network was given.
+        warm_loss: the same of the network that was given.
+    """
+
+    warm: bool
+    cold_loss: float | None = None
+    warm_loss: float | None = None
+
+
+class Trained(NamedTuple):
+    """A network optimised on a frame, how it began, and Eq. 8 before each step."""
+
+    network: Network
+    start: Start
+    losses: list[float]
+
+
+def trained(
+    state: StageImages,
+    settings: Settings,
+    *,
+    warm_start: Network | None = None,
+    progress: Progress | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Trained:
+    """A network optimised on the state's halves; arguments as in :func:`selfcorrect.correct`."""
+    began = time.perf_counter()
+    generator = torch.Generator().manual_seed(settings.seed)
+    guides = _training_guides(state, settings, generator)
+    network = Network.for_guides(guides[0], settings, generator)
+    start = Start(warm=False)
+    if warm_start is not None:
+        network.traits.check(warm_start.traits)
+        start = _start(network, warm_start, guides, settings)
+    if start.warm and warm_start is not None:
+        network.load_state_dict(warm_start.state_dict())
+    limits = Limits(stop=stop or Limits.stop)
+    if settings.time_budget:
+        reserved = _seconds_after_training(network, state, settings)
+        limits = replace(limits, seconds=settings.time_budget - reserved - (time.perf_counter() - began))
+    losses = train(network, guides, _warm(settings) if start.warm else settings, generator, progress, limits)
+    return Trained(network, start, losses)
+
+
+def inferred(state: StageImages, network: Network, settings: Settings, keep: Keep) -> Tensor:
+    """The corrected image, of each half with its own denoised image, and of both with the full one where that helps.
+
+    ``keep`` is called with rows and what the network makes there of each half with its own image, of radiance times
+    the state's scale: whole corrected halves are not held here.
+    """
+    images = Scaled(state.images[0], state.scale), Scaled(state.images[1], state.scale)
+    full = Scaled(state.full, state.scale)
+    image = torch.empty_like(state.full)
+
+    def corrected(rows: slice, shown: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        a, b = (infer(network, half, settings, scale=state.scale, denoised=shown, rows=rows) for half in state.halves)
+        return a, b
+
+    for rows in bands(image.shape[0], SIDE):
+        halves = corrected(rows)
+        image[rows] = mean(halves)
+        if settings.inference == "full":
+            trust = trust_in_full(images, full, rows).to(image.dtype)
+            image[rows] += trust * (mean(corrected(rows, state.full)) - image[rows])
+        keep(rows, halves)
+    return scaled(image.clamp_(min=0), 1 / state.scale)
+
+
+def _training_guides(state: StageImages, settings: Settings, generator: torch.Generator) -> tuple[Guides, Guides]:
+    """What the network is trained on: both halves whole, or crops of them at the same places."""
+    size = (state.full.shape[0], state.full.shape[1])
+    margin = settings.window // 2
+    regions = crops(size, settings, generator)
+    if not regions:
+        margin += max(overhang(size, s) for s in (settings, _warm(settings)))
+
+    def one(half: Half, denoised: Tensor) -> Guides:
+        cut = partial(
+            Guides.of_half,
+            half.color,
+            denoised,
+            margin=margin,
+            albedo=half.albedo,
+            normal=half.normal,
+            visibility=half.visibility,
+            scale=state.scale,
+        )
+        return Guides.stack([cut(region=region) for region in regions]) if regions else cut()
+
+    return one(state.halves[0], state.images[0]), one(state.halves[1], state.images[1])
+
+
+def _seconds_after_training(network: Network, state: StageImages, settings: Settings) -> float:
+    """How long inference and guard will take, by the time of a small tile."""
+    height, width, _ = state.full.shape
+    region = (0, 0, min(height, _TRIAL), min(width, _TRIAL))
+    tile = partial(infer_tile, network, state.halves[0], settings, region, scale=state.scale)
+    tile()  # the first call is slower
+    start = time.perf_counter()
+    tile()
+    inference = (time.perf_counter() - start) / (region[2] * region[3])
+    passes = 4 if settings.inference == "full" else 2
+    return height * width * (inference * passes + (_GUARD_SECONDS if settings.guard else 0.0))
+
+
+def _warm(settings: Settings) -> Settings:
+    """The settings of a frame that starts warm: never more steps than one that starts cold."""
+    steps = settings.warm_steps or settings.steps
+    return replace(
+        settings,
+        steps=min(steps, settings.steps or steps),
+        learning_rate=settings.warm_learning_rate or settings.learning_rate,
+    )
+
+
+def _start(cold: Network, warm: Network, guides: tuple[Guides, Guides], settings: Settings) -> Start:
+    """Which of both networks fits the frame better before any training.
+
+    The network that is given has to be better by more than chance, its standard error over the sample's patches: a
+    frame that starts warm trains for fewer steps, and those would not be enough after a cut.
+    """
+    here = copy.deepcopy(cold)  # on the device of the guides
+    here.load_state_dict(warm.state_dict())
+    cold_losses, warm_losses = (starting_losses(network, guides, settings) for network in (cold, here))
+    gain = cold_losses - warm_losses
+    chance = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return Start(float(gain.mean()) > chance, float(cold_losses.mean()), float(warm_losses.mean()))

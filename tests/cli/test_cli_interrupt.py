@@ -1,0 +1,89 @@
+"""Ctrl-C and the time budget, in the real command."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers.commands import BOX, refused, run
+
+from selfcorrect import cli
+
+ENDLESS = [
+    "--steps",
+    "1000000",
+    "--visits",
+    "0",
+    "--patch",
+    "16",
+    "--batch",
+    "1",
+    "--window",
+    "5",
+    *BOX,
+]
+
+
+def interrupted(out: Path, halves: tuple[Path, Path]) -> subprocess.CompletedProcess[str]:
+    """The command, with Ctrl-C pressed once training has begun."""
+    command = [sys.executable, "-m", "selfcorrect", "frame", *map(str, halves), "-o", str(out), *ENDLESS]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    lines = []
+    for line in process.stderr:
+        lines.append(line)
+        if line.startswith("denoiser:"):
+            break
+    time.sleep(1.5)  # the box is done at once; then it trains
+    process.send_signal(signal.SIGINT)
+    output, rest = process.communicate(timeout=120)
+    return subprocess.CompletedProcess(command, process.returncode, output, "".join(lines) + rest)
+
+
+def test_one_interrupt_writes_what_has_been_learned(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out.exr"
+    result = interrupted(out, halves)
+    assert result.returncode == 0, result.stderr
+    assert "again to write nothing" in result.stderr
+    assert result.stderr.count("written after") == 1
+    assert out.exists()
+    assert sorted(os.listdir(tmp_path)) == ["a.exr", "b.exr", "out.exr"]
+
+
+def test_a_second_interrupt_writes_nothing(
+    halves: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.exr"
+    out.write_bytes(b"what was there before")
+    asked, before = [], signal.getsignal(signal.SIGINT)
+
+    def twice(*_: object) -> None:
+        asked.append(True)
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("selfcorrect.cli.runner._Progress.__call__", twice)
+    assert cli.main(["frame", *map(str, halves), "-o", str(out), *ENDLESS]) == 130
+    assert len(asked) == 1
+    assert "nothing" in capfd.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is before
+    assert out.read_bytes() == b"what was there before"
+    assert sorted(os.listdir(tmp_path)) == ["a.exr", "b.exr", "out.exr"]
+
+
+@pytest.mark.parametrize("text", ["soon", "10x", ""])
+def test_a_time_that_is_none_is_named(halves: tuple[Path, Path], tmp_path: Path, text: str) -> None:
+    assert "a time like 10s or 2m" in refused("frame", *halves, "-o", tmp_path / "o.exr", "--time-budget", text)
+
+
+def test_the_time_budget_ends_training(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    result = run("frame", *halves, "-o", tmp_path / "o.exr", *ENDLESS, "--time-budget", "0.05m", "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["settings"]["time_budget"] == 3.0
+    assert report["steps"] < 1_000_000
+    assert report["seconds"]["train"] < 3.5

@@ -1,0 +1,110 @@
+"""Memory: the real command stays under what is told of it, and a frame that does not fit is refused at once."""
+
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from selfcorrect import Settings
+from selfcorrect.cli.memory import GIB, needs, parse_size, scratch_within
+from selfcorrect.errors import FileError, SettingsError
+from selfcorrect.exr import header as exrheader
+from selfcorrect.files import Sources
+
+SIZE = (1000, 2100)  # more than two million pixels: trained on crops, in several strips of tiles
+QUICK = [
+    "--steps",
+    "1",
+    "--batch",
+    "1",
+    "--patch",
+    "16",
+    "--window",
+    "3",
+    "--layers",
+    "2",
+    "--filters",
+    "2",
+    "--inference",
+    "halves",
+]
+
+
+def write_half(path: Path, seed: int, size: tuple[int, int], dtype: type) -> str:
+    generator = np.random.default_rng(seed)
+    names = ["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z"]
+    channels = {name: generator.random(size, dtype=np.float32).astype(dtype) for name in names}
+    OpenEXR.File({"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(str(path))
+    return str(path)
+
+
+def sources(folder: Path, size: tuple[int, int] = (30, 40), dtype: type = np.float16) -> Sources:
+    return Sources(*(write_half(folder / f"{half}.exr", seed, size, dtype) for seed, half in enumerate("ab")))
+
+
+def test_the_command_takes_no_more_than_is_told(tmp_path: Path) -> None:
+    """The peak of the whole command; a denoiser that takes nothing beside its images."""
+    frame, settings = sources(tmp_path, SIZE), Settings.preset("balanced", patch=16, steps=1)
+    (tmp_path / "same.py").write_text(
+        "class Same:\n"
+        "    name, features, reads_only = 'same', frozenset({'albedo', 'normal'}), True\n"
+        "    def denoise(self, color, albedo, normal):\n"
+        "        return color.clone()\n"
+    )
+    code = (
+        "import resource, sys; from selfcorrect import cli\n"
+        "code = cli.main(sys.argv[1:]); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss); sys.exit(code)"
+    )
+    denoiser = ["--denoiser", f"{tmp_path / 'same.py'}:Same", "--threads", "1"]
+    command = [sys.executable, "-c", code, "frame", frame.a, frame.b, "-o", str(tmp_path / "out.exr")]
+    result = subprocess.run([*command, *QUICK, *denoiser], capture_output=True, text=True, timeout=300, check=False)
+    assert result.returncode == 0, result.stderr
+    peak = int(result.stdout) * 1024
+    told = max(needs(frame, settings))
+    assert 0.4 * told < peak < told
+
+
+def eight_k(folder: Path, dtype: type) -> Sources:
+    """Files whose headers say that they are of 8K."""
+    frame = sources(folder, dtype=dtype)
+    data = bytearray(Path(frame.a).read_bytes())
+    (header,), _ = exrheader.parse(bytes(data), frame.a)
+    struct.pack_into("<4i", data, header.attributes["dataWindow"].offset, 0, 0, 7679, 4319)
+    Path(frame.a).write_bytes(data)
+    return frame
+
+
+def test_eight_k_fits_in_six_gibibytes(tmp_path: Path) -> None:
+    """With what OIDN takes where nothing bounds it, 1.5 GiB; of floats, with what it can do with."""
+    settings = Settings.preset("balanced")
+    assert scratch_within(6 * GIB, eight_k(tmp_path, np.float16), settings) > 1.5 * GIB
+    half = needs(Sources(str(tmp_path / "a.exr"), ""), settings)
+    assert scratch_within(6 * GIB, eight_k(tmp_path, np.float32), settings) > 1.0 * GIB
+    full = needs(Sources(str(tmp_path / "a.exr"), ""), settings)
+    assert full.correct - half.correct == 7680 * 4320 * 2 * 12, "two G-buffers of both halves"
+
+
+def test_a_frame_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    frame, settings = sources(tmp_path), Settings.preset("balanced")
+    with pytest.raises(SettingsError, match=r"a.exr: expected --maxmem of at least 1\.0G .*, but got 0\.5G"):
+        scratch_within(parse_size("512M"), frame, settings)
+    with pytest.raises(FileError, match="expected an OpenEXR file"):
+        needs(Sources(str(tmp_path / "none.exr"), frame.b), settings)
+    (tmp_path / "empty.exr").touch()
+    with pytest.raises(FileError, match="an empty file"):
+        needs(Sources(str(tmp_path / "empty.exr"), frame.b), settings)
+
+
+@pytest.mark.parametrize(("text", "size"), [("6G", 6 * GIB), ("800M", 800 * 2**20), ("1.5gib", 3 * GIB // 2), ("9", 9)])
+def test_sizes(text: str, size: int) -> None:
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "G", "6 apples", "-1G", "1e9"])
+def test_what_is_no_size_is_refused(text: str) -> None:
+    with pytest.raises(SettingsError, match="expected a size such as 6G"):
+        parse_size(text)
