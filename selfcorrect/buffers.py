@@ -43,8 +43,8 @@ BUFFERS = (
     DENOISED,
     Buffer("albedo", "ρ", 3, "feature", 1, scale=True, distance="squared", first_bandwidth=0.2),
     Buffer("normal", "n", 3, "feature", 3, scale=True, distance="squared", first_bandwidth=0.4),
-    Buffer("visibility", "v", 1, "feature", 2, scale=False, distance="squared", first_bandwidth=0.2),
     Buffer("depth", "d", 1, "feature", None, scale=False, distance=None),
+    Buffer("visibility", "v", 1, "feature", 2, scale=False, distance="squared", first_bandwidth=0.2),
 )
 """Every buffer, in the order of the network's outputs: the scales β, then the bandwidths γ."""
 

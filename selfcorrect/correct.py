@@ -1,34 +1,31 @@
 """The stages on one frame, in order, and the guard. No files, no printing, no reference."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from selfcorrect import stages
 from selfcorrect.errors import FrameError
-from selfcorrect.frame import Frame, mean
-from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light
+from selfcorrect.frame import Candidate, Frame
+from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.bands import average, tile_means
-from selfcorrect.image.exposure import Scaled, scaled
+from selfcorrect.image.exposure import Scaled, scale_
 from selfcorrect.settings import Settings
-from selfcorrect.stages import steps, weights
 from selfcorrect.stages.core.network import Network
-from selfcorrect.stages.core.stage import Start, inferred, trained
 from selfcorrect.stages.core.train import Progress
-from selfcorrect.stages.steps import StageImages, SubImage
+from selfcorrect.stages.images import StageImages
+from selfcorrect.stages.stage import Stage, Start, Work
 
-__all__ = ["Result", "Start", "correct"]
+__all__ = ["COLOR_OUTPUT", "Result", "Start", "correct"]
 
-_STEPS = {
-    "regression": steps.regress,
-    "james-stein": steps.james_stein,
-    "neural-james-stein": steps.neural_james_stein,
-    "deep-combiner": steps.deep_combiner,
-    "deep-combiner-4": steps.deep_combiner_4,
-}
+COLOR_OUTPUT = "color"
+"""Name of the corrected colour among the outputs."""
+
+_MAPS = ("blend", "error.before", "error.after")
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,25 +33,34 @@ class Result:
     """What :func:`correct` gives back.
 
     Attributes:
-        image: corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as the frame's colour was.
+        outputs: images by name. ``color`` is the corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as
+            the frame's colour was. Where the guard is on there are its maps, tensors (H, W): ``blend`` (weight of what
+            the stages made), and ``error.before`` and ``error.after`` (estimated relative squared error).
         network: the trained network, for the next call's ``warm_start``; None without the core.
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
-        aovs: the guard's maps, each (H, W): ``blend`` (weight of the corrected image), and ``error.before`` and
-            ``error.after`` (estimated relative squared error); empty where the guard is off.
         input_scale: what radiance was multiplied by.
         start: whether training went on from ``warm_start``, and why.
     """
 
-    image: Any
+    outputs: Mapping[str, Any]
     network: Network | None
     losses: list[float]
     seconds: dict[str, float]
     estimate: Estimate | None
-    aovs: dict[str, Tensor]
     input_scale: float
     start: Start
+
+    @property
+    def image(self) -> Any:
+        """The corrected colour."""
+        return self.outputs[COLOR_OUTPUT]
+
+    @property
+    def maps(self) -> dict[str, Tensor]:
+        """What the guard found."""
+        return {name: self.outputs[name] for name in _MAPS if name in self.outputs}
 
 
 def correct(
@@ -64,6 +70,8 @@ def correct(
     warm_start: Network | None = None,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
+    opened: Sequence[Stage] | None = None,
+    extra: Mapping[str, Any] | None = None,
 ) -> Result:
     """Correct a denoised frame (Back et al. 2022).
 
@@ -74,73 +82,63 @@ def correct(
             is. Where Eq. 8 does not show it to be the better start, as after a cut, a new one is taken.
         progress: called as ``progress(step, steps, loss)`` after every optimiser step.
         stop: asked before every optimiser step; when it says True, training ends and the result so far is inferred.
+        opened: the settings' stages, to spare a shot from reading their weights for every frame
+            (:func:`selfcorrect.stages.opened`).
+        extra: by name of a stage, what it needs beyond the halves, such as the
+            :class:`selfcorrect.stages.deep_combiner_4.SubImages` of deep-combiner-4.
 
     Returns:
         The corrected image and the network. The same seed gives the same bits on the same machine and number of
         threads (``torch.set_num_threads``).
 
     Raises:
-        FrameError: the frame has no denoised halves, or no sub-images for the stage that takes those, or
-            ``warm_start`` was trained with other buffers or settings.
+        FrameError: the frame has no denoised halves, or lacks what a stage needs beyond them, or ``warm_start`` was
+            trained with other buffers or settings.
         FileError: the weights of a trained stage are not there or do not fit.
+        SettingsError: a stage stands where it cannot.
     """
     settings = settings or Settings.preset(Settings.default())
-    if frame.denoised is None:
-        raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
-    if warm_start is not None and "core" not in settings.stage_names:
-        raise FrameError(f"expected the stage core with a warm start, but got the stages {settings.stages}")
-    weights.check(settings)
-    given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
-    sub_images = _sub_images(frame) if "deep-combiner-4" in settings.stage_names else ()
-    first = StageImages(frame.halves, given, settings.input_scale or _automatic_scale(frame), sub_images)
-    state, core, seconds = first, None, dict[str, float]()
-
-    def timed(name: str, begun: float) -> None:
-        seconds[name] = time.perf_counter() - begun
-
-    evidence = Evidence(first.scaled_color, first.scaled_images) if settings.guard else None
-    for position, name in enumerate(settings.stage_names, 1):
+    given, *more = frame.candidates
+    if opened is None:
+        opened = stages.opened(settings)
+    if warm_start is not None and not any(stage.learns for stage in opened):
+        learning = " or ".join(name for name, stage in stages.STAGES.items() if stage.learns)
+        raise FrameError(f"expected the stage {learning} with a warm start, but got the stages {settings.stages}")
+    first = StageImages.of(frame.halves, given, settings.input_scale or _automatic_scale(frame))
+    judge = _Judge(first, more) if settings.guard else None
+    state, learned, seconds = first, None, dict[str, float]()
+    for stage in opened:
         begun = time.perf_counter()
-        if name == "core":
-            core = trained(state, settings, warm_start=warm_start, progress=progress, stop=stop)
-            timed("train", begun)
-            begun = time.perf_counter()
-            last = position == len(settings.stage_names)
-            state = _after_core(state, core.network, settings, evidence if last else None)
-            timed("infer", begun)
-        else:
-            state = _STEPS[name](state, settings)
-            timed(name, begun)
+        work = Work(
+            warm_start=warm_start if stage.learns else None,
+            progress=progress,
+            stop=stop,
+            extra=(extra or {}).get(stage.name),
+            keep=judge.keep if judge is not None and stage is opened[-1] else None,
+        )
+        state, just_learned, parts = stage.run(state, work)
+        learned = just_learned or learned
+        seconds |= parts or {stage.name: time.perf_counter() - begun}
     image, guarded = state.full.clamp(min=0), None
-    if evidence is not None:
+    if judge is not None:
         begun = time.perf_counter()
-        if not evidence.complete:
-            evidence.add(slice(0, frame.size[0]), (state.scaled_images[0][:], state.scaled_images[1][:]))
-        image, guarded = _guarded(first, image, evidence)
-        timed("guard", begun)
+        image, guarded = judge.blend(state, image)
+        seconds["guard"] = time.perf_counter() - begun
+    maps = dict(zip(_MAPS, guarded.maps(), strict=True)) if guarded else {}
     return Result(
-        image=frame.like_input(image),
-        network=core.network if core else None,
-        losses=core.losses if core else [],
+        outputs={COLOR_OUTPUT: frame.like_input(image), **maps},
+        network=learned.network if learned else None,
+        losses=learned.losses if learned else [],
         seconds=seconds,
         estimate=guarded.estimate if guarded else None,
-        aovs=dict(zip(("blend", "error.before", "error.after"), guarded.maps(), strict=True)) if guarded else {},
         input_scale=first.scale,
-        start=core.start if core else Start(warm=False),
+        start=learned.start if learned else Start(warm=False),
     )
-
-
-def _sub_images(frame: Frame) -> tuple[SubImage, ...]:
-    if frame.sub_images is None or frame.denoised_sub_images is None:
-        got = "none" if frame.sub_images is None else "such as are not denoised; call frame.denoise(denoiser)"
-        raise FrameError(f"expected a frame with four denoised sub-images for the stage deep-combiner-4, but got {got}")
-    return tuple(SubImage(*each) for each in zip(frame.sub_images, frame.denoised_sub_images, strict=True))
 
 
 def _automatic_scale(frame: Frame) -> float:
     """What brings the denoised frame's mean near 1; by the mean of roots, which a few bright pixels do not move."""
-    denoised = frame.denoised
-    assert denoised is not None  # correct() has checked; tells the type checker
+    denoised = frame.candidates[0].halves
 
     def roots(rows: slice) -> Tensor:
         return torch.stack([half[rows].double().mean(-1).clamp(min=0).sqrt() for half in denoised])
@@ -149,25 +147,30 @@ def _automatic_scale(frame: Frame) -> float:
     return 1 / root**2 if root > 0 else 1.0
 
 
-def _after_core(state: StageImages, network: Network, settings: Settings, evidence: Evidence | None) -> StageImages:
-    """The state after the core; where nothing but the guard comes after it, the halves go to its evidence alone."""
-    if evidence is not None:
-        return state._replace(full=inferred(state, network, settings, evidence.add))
-    images = torch.empty_like(state.full), torch.empty_like(state.full)
+class _Judge:
+    """The guard on one frame: what the stages make of it, and further candidates, against what the denoiser had."""
 
-    def keep(rows: slice, halves: tuple[Tensor, Tensor]) -> None:
-        for image, half in zip(images, halves, strict=True):
-            image[rows] = half / state.scale
+    def __init__(self, first: StageImages, more: Sequence[Candidate]):
+        self._first = first
+        self._full = [Scaled(c.full, first.scale) for c in more]
+        self._halves = [tuple(Scaled(half, first.scale) for half in c.halves) for c in more]
+        self._evidence = Evidence(first.scaled_color, first.scaled_images, 1 + len(more))
 
-    full = inferred(state, network, settings, keep)
-    return state.then(images, full)
+    def keep(self, rows: slice, halves: tuple[Tensor, Tensor]) -> None:
+        """Gather from rows of the halves that the stages made."""
+        others = [(a[rows], b[rows]) for a, b in self._halves]
+        self._evidence.add(rows, *others, halves)
 
-
-def _guarded(first: StageImages, image: Tensor, evidence: Evidence) -> tuple[Tensor, Guarded]:
-    """What the stages made of the frame, guarded against what the denoiser had; ``image`` is used up."""
-    full = Scaled(first.full, first.scale)
-    guarded = guard(evidence, full, scaled(image, first.scale), scale=first.scale)
-    if not guarded.estimate.improved:
-        return image.copy_(first.full), guarded  # not the frame's own tensor: the caller may change the result
-    kept = keep_light(guarded.image, full, first.scaled_color)
-    return scaled(kept, 1 / first.scale).clamp_(min=0), guarded
+    def blend(self, state: StageImages, image: Tensor) -> tuple[Tensor, Guarded]:
+        """The output, made of ``image`` and the other candidates; ``image`` is used up."""
+        first, evidence = self._first, self._evidence
+        if not evidence.complete:
+            everything = slice(0, image.shape[0])
+            self.keep(everything, (state.scaled_images[0][:], state.scaled_images[1][:]))
+        full = Scaled(first.full, first.scale)
+        scale_(image, first.scale)
+        guarded = guard(evidence, full, [*self._full, image], scale=first.scale, out=image)
+        if not guarded.estimate.improved:
+            return image.copy_(first.full), guarded  # not the frame's own tensor: the caller may change the result
+        keep_light_(image, full, first.scaled_color)
+        return scale_(image, 1 / first.scale).clamp_(min=0), guarded

@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from selfcorrect import exr
-from selfcorrect.correct import Result
+from selfcorrect.buffers import FEATURES
+from selfcorrect.correct import COLOR_OUTPUT
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
-from selfcorrect.frame import Frame, repaired
-from selfcorrect.settings import Settings
+from selfcorrect.frame import Frame
+from selfcorrect.image.repair import repaired
 
 __all__ = ["Images", "Loaded", "Origin", "Sources", "load", "load_images", "save", "save_combined"]
-
-_FEATURES = ("albedo", "normal", "visibility", "depth")
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,6 @@ class Sources:
         denoised_b: denoised half b.
         denoised: denoised mean of both halves.
         mapping: role → channel, for what no table knows.
-        sub_images: the two renders whose mean is half a, and those of half b; or none.
     """
 
     a: str
@@ -41,7 +39,6 @@ class Sources:
     denoised_b: str | None = None
     denoised: str | None = None
     mapping: Mapping[str, str] | None = None
-    sub_images: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ def load(sources: Sources) -> Loaded:
         )
     pairs: dict[str, Any] = {"color": (half_a.buffers["color"], half_b.buffers["color"])}
     taken = {"color": half_a.taken["color"]}
-    for role in _FEATURES:
+    for role in (feature.name for feature in FEATURES):
         in_a, in_b = role in half_a.buffers, role in half_b.buffers
         if in_a != in_b:
             there, lacking = (sources.a, sources.b) if in_a else (sources.b, sources.a)
@@ -110,9 +107,6 @@ def load(sources: Sources) -> Loaded:
         taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
     if sources.denoised:
         pairs["denoised_full"] = _color_of(sources.denoised, (height, width))
-    if sources.sub_images:
-        _check_different(sources.sub_images)
-        pairs["sub_images"] = tuple(_color_of(path, (height, width)) for path in sources.sub_images)
     return Loaded(Frame(**pairs), Origin(sources.a, taken, stamp))
 
 
@@ -140,16 +134,15 @@ def _stamp(path: str) -> tuple[int, int, int]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def save(
-    path: str,
-    origin: Origin,
-    result: Result,
-    *,
-    settings: Settings,
-    details: Mapping[str, Any],
-    extra: Mapping[str, Any] | None = None,
-) -> int:
-    """Write the corrected colour under the names it had in half a, with all else of half a.
+def save(path: str, origin: Origin, outputs: Mapping[str, Any], attributes: Mapping[str, str]) -> int:
+    """Write a frame's outputs with all else of half a.
+
+    Args:
+        path: the file to write.
+        origin: half a.
+        outputs: images by name; ``color`` takes the place of half a's, any other becomes the channel
+            ``selfcorrect.NAME``.
+        attributes: name → text.
 
     Returns:
         how many values lay beyond the range of half floats and were clipped, where the file holds those.
@@ -159,9 +152,9 @@ def save(
     """
     if _stamp(origin.path) != origin.stamp:
         raise FileError(f"{origin.path}: expected the file that was read, but got one changed since; run again")
-    attributes = {"selfcorrect/settings": json.dumps(settings.to_dict()), "selfcorrect/run": json.dumps(dict(details))}
     file = exr.read(origin.path)
-    return exr.write(path, file, result.image, origin.taken["color"], attributes, extra=extra)
+    extra = {f"selfcorrect.{name}": image for name, image in outputs.items() if name != COLOR_OUTPUT}
+    return exr.write(path, file, outputs[COLOR_OUTPUT], origin.taken["color"], attributes, extra=extra)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +168,17 @@ class Images:
 
     images: tuple[Tensor, ...]
     source: exr.HalfFile
+
+
+def load_extra(paths: Sequence[str], size: tuple[int, int]) -> tuple[Tensor, ...]:
+    """The colours of images that a stage needs beyond the halves, of this height and width.
+
+    Raises:
+        FileError: a file cannot be read, or the same file was given twice.
+        FrameError: a size does not fit.
+    """
+    _check_different(paths)
+    return tuple(_color_of(path, size) for path in paths)
 
 
 def load_images(paths: Sequence[str]) -> Images:

@@ -6,44 +6,56 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from selfcorrect.buffers import BUFFERS, COLOR, DENOISED, FEATURES, Buffer
 from selfcorrect.errors import FrameError
 from selfcorrect.image.bands import bands
+from selfcorrect.image.repair import Repairs, as_tensor, repair
 
-__all__ = ["Frame", "Half", "Repairs", "mean", "repaired"]
+__all__ = ["Candidate", "DualDenoiser", "Frame", "Half", "checked", "mean"]
 
 Pair = tuple[Any, Any]
-_CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 1, "depth": 1}
-_RADIANCE = ("color", "denoised", "denoised_full", "sub_images", "denoised_sub_images")
-_SUB_IMAGE_TOLERANCE = 5e-3  # of radiance: half floats round to 1/2048, and a mean of such again
-_SUB_IMAGE_PIXELS = 0.01  # share that may differ: what was repaired, or lay beyond half floats
-_FEATURES = ("albedo", "normal", "visibility", "depth")
-
-
-class Repairs(NamedTuple):
-    """How many pixels of a buffer were changed on the way in."""
-
-    non_finite: int
-    negative: int
+_DENOISED_FULL = "denoised_full"
 
 
 class Half(NamedTuple):
     """The buffers of one half, (H, W, C) like the frame's; None where the frame has no such buffer."""
 
     color: Tensor
-    denoised: Tensor | None
-    albedo: Tensor | None
-    normal: Tensor | None
-    visibility: Tensor | None
-    depth: Tensor | None
+    denoised: Tensor | None = None
+    albedo: Tensor | None = None
+    normal: Tensor | None = None
+    visibility: Tensor | None = None
+    depth: Tensor | None = None
+
+    @property
+    def features(self) -> dict[str, Tensor]:
+        """The G-buffers that there are, by name."""
+        values = {buffer.name: getattr(self, buffer.name) for buffer in FEATURES}
+        return {name: value for name, value in values.items() if value is not None}
 
 
-class _Dual(Protocol):
+class Candidate(NamedTuple):
+    """What the output may be made of: an image of the frame, and the same made of each half alone.
+
+    Attributes:
+        name: what the log calls it.
+        halves: (H, W, 3) linear radiance ≥ 0 each. Half a's may not know half b, which is its witness.
+        full: the same of both halves together.
+    """
+
+    name: str
+    halves: tuple[Tensor, Tensor]
+    full: Tensor
+
+
+class DualDenoiser(Protocol):
     """A denoiser that takes both halves at once."""
 
-    def pair(self, color: Pair, **features: Pair | None) -> Pair: ...
+    def pair(self, color: Pair, **features: Pair | None) -> Pair:
+        """The denoised halves."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +76,7 @@ class Frame:
         visibility: 1 channel.
         depth: 1 channel.
         denoised_full: the denoised mean of both halves, a single array.
-        sub_images: four renders with seeds of their own, the first two of them with half a as their mean, the others
-            with half b; for the stage deep-combiner-4.
-        denoised_sub_images: those denoised, each on its own.
+        more: further images of the frame that the guard may blend in, finite and ≥ 0.
 
     Raises:
         FrameError: sizes or channel counts do not fit.
@@ -79,58 +89,46 @@ class Frame:
     visibility: Pair | None = None
     depth: Pair | None = None
     denoised_full: Any = None
-    sub_images: Any = None
-    denoised_sub_images: Any = None
+    more: tuple[Candidate, ...] = ()
     repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
     constant: list[str] = field(init=False, default_factory=list)
     _like: Any = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        for name in _CHANNELS:
-            pair = getattr(self, name)
-            if pair is None and name != "color":
+        for buffer in BUFFERS:
+            pair = getattr(self, buffer.name)
+            if pair is None and buffer is not COLOR:
                 continue
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-                raise FrameError(f"expected {name} as a pair of arrays (half a, half b), but got {type(pair).__name__}")
-            if name == "color":
+                got = type(pair).__name__
+                raise FrameError(f"expected {buffer.name} as a pair of arrays (half a, half b), but got {got}")
+            if buffer is COLOR:
                 object.__setattr__(self, "_like", _empty_like(pair[0]))
-            self._set(name, tuple(pair))
+            self._set(buffer, tuple(pair))
         if self.denoised_full is not None:
-            self._set("denoised_full", (self.denoised_full,))
-        for name in ("sub_images", "denoised_sub_images"):
-            if getattr(self, name) is not None:
-                self._set_sub_images(name, getattr(self, name))
+            self._set_full(self.denoised_full)
+        for candidate in self.more:
+            for image in (*candidate.halves, candidate.full):
+                if tuple(image.shape) != (*self.size, 3):
+                    raise FrameError(
+                        f"expected the candidate {candidate.name} of shape {(*self.size, 3)}, "
+                        f"but got {tuple(image.shape)}"
+                    )
 
-    def _set_sub_images(self, name: str, arrays: Any) -> None:
-        if not isinstance(arrays, (tuple, list)) or len(arrays) != 4:
-            got = len(arrays) if isinstance(arrays, (tuple, list)) else type(arrays).__name__
-            raise FrameError(f"expected {name} as four arrays (two of half a, two of half b), but got {got}")
-        self._set(name, tuple(arrays))
-        if name == "sub_images":
-            for half, color, pair in zip("ab", self.color, (self.sub_images[:2], self.sub_images[2:]), strict=True):
-                _check_sub_images(half, color, pair)
+    def _set(self, buffer: Buffer, arrays: tuple[Any, ...]) -> None:
+        """Check, repair and store the pair of one buffer."""
+        names = [f"{buffer.name} of half {half}" for half in "ab"]
+        size = None if buffer is COLOR else self.size
+        tensors, self.repairs[buffer.name] = checked(buffer, arrays, names, size)
+        if buffer in FEATURES and all(bool((tensor == tensor[0, 0]).all()) for tensor in tensors):
+            self.constant.append(buffer.name)
+            object.__setattr__(self, buffer.name, None)
+        else:
+            object.__setattr__(self, buffer.name, tensors)
 
-    def _set(self, name: str, arrays: tuple[Any, ...]) -> None:
-        """Check, repair and store the arrays of one buffer."""
-        size = None if name == "color" else self.size
-        tensors, counts = [], Repairs(0, 0)
-        for what, array in zip(_names(name), arrays, strict=False):
-            tensor = _as_tensor(array, what, _CHANNELS.get(name, 3), half=name in _FEATURES)
-            if size is not None and tensor.shape[:2] != size:
-                raise FrameError(
-                    f"expected {what} of {size[1]}x{size[0]} pixels like the colour of half a, "
-                    f"but got {tensor.shape[1]}x{tensor.shape[0]}"
-                )
-            size = (tensor.shape[0], tensor.shape[1])
-            tensor, repairs = _repair(tensor, radiance=name in _RADIANCE)
-            tensors.append(tensor)
-            counts = Repairs(*(x + y for x, y in zip(counts, repairs, strict=True)))
-        self.repairs[name] = counts
-        if name in _FEATURES and all(bool((tensor == tensor[0, 0]).all()) for tensor in tensors):
-            self.constant.append(name)
-            object.__setattr__(self, name, None)
-            return
-        object.__setattr__(self, name, tensors[0] if name == "denoised_full" else tuple(tensors))
+    def _set_full(self, array: Any) -> None:
+        (tensor,), self.repairs[_DENOISED_FULL] = checked(COLOR, (array,), [_DENOISED_FULL], self.size)
+        object.__setattr__(self, _DENOISED_FULL, tensor)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -143,11 +141,23 @@ class Frame:
         """Half a and half b."""
 
         def one(i: int) -> Half:
-            pairs = {name: getattr(self, name) for name in Half._fields}
+            pairs = {buffer.name: getattr(self, buffer.name) for buffer in BUFFERS}
             own: dict[str, Any] = {name: None if pair is None else pair[i] for name, pair in pairs.items()}
             return Half(**own)
 
         return one(0), one(1)
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """The images to correct: first the denoised one, which the output must not be worse than.
+
+        Raises:
+            FrameError: the frame has no denoised halves.
+        """
+        if self.denoised is None:
+            raise FrameError("expected a frame with denoised halves, but got none; call frame.denoise(denoiser) first")
+        full = mean(self.denoised) if self.denoised_full is None else self.denoised_full
+        return Candidate("denoised", self.denoised, full), *self.more
 
     def denoise(self, denoiser: Callable[..., Any], *, full: bool = True) -> "Frame":
         """This frame with each half denoised on its own, with its own G-buffers.
@@ -157,13 +167,11 @@ class Frame:
                 albedo and normal may be of half floats. If its ``dual`` is True, it is called once, as
                 ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs.
             full: also denoise the mean of the halves; with a dual denoiser it is the mean of the denoised halves.
-
-        Sub-images are denoised with the G-buffers of their half; by a dual denoiser as the two halves of that.
         """
         if getattr(denoiser, "dual", False):
-            features = {name: getattr(self, name) for name in ("albedo", "normal", "depth", "visibility")}
-            pair = cast(_Dual, denoiser).pair(self.color, **features)
-            return self.with_denoised(pair, mean(pair) if full else None, self._denoised_sub_images(denoiser))
+            features = {buffer.name: getattr(self, buffer.name) for buffer in FEATURES}
+            pair = cast(DualDenoiser, denoiser).pair(self.color, **features)
+            return self.with_denoised(pair, mean(pair) if full else None)
         inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
         denoised_full = None
         if full:  # first: there is no other denoised image in memory yet
@@ -171,43 +179,35 @@ class Frame:
             denoised_full = denoiser(color, albedo=albedo, normal=normal)
             del color, albedo, normal
         pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
-        return self.with_denoised(pair, denoised_full, self._denoised_sub_images(denoiser))
+        return self.with_denoised(pair, denoised_full)
 
-    def _denoised_sub_images(self, denoiser: Callable[..., Any]) -> tuple[Any, ...] | None:
-        if self.sub_images is None:
-            return None
-        denoised: list[Any] = []
-        for half, pair in zip(self.halves, (self.sub_images[:2], self.sub_images[2:]), strict=True):
-            if getattr(denoiser, "dual", False):
-                buffers = {name: getattr(half, name) for name in ("albedo", "normal", "depth", "visibility")}
-                features = {name: None if buffer is None else (buffer, buffer) for name, buffer in buffers.items()}
-                denoised += cast(_Dual, denoiser).pair(pair, **features)
-            else:
-                denoised += [denoiser(image, albedo=half.albedo, normal=half.normal) for image in pair]
-        return tuple(denoised)
-
-    def with_denoised(self, denoised: Pair, denoised_full: Any = None, denoised_sub_images: Any = None) -> "Frame":
+    def with_denoised(self, denoised: Pair, denoised_full: Any = None) -> "Frame":
         """This frame with these denoised images; its other buffers are not checked again."""
-        frame = object.__new__(Frame)
-        for name, value in vars(self).items():
-            object.__setattr__(frame, name, value)
-        object.__setattr__(frame, "repairs", dict(self.repairs))
-        frame._set("denoised", denoised)
+        frame = self._copy()
+        frame._set(DENOISED, denoised)
         if denoised_full is not None:
-            frame._set("denoised_full", (denoised_full,))
-        if denoised_sub_images is not None:
-            frame._set_sub_images("denoised_sub_images", denoised_sub_images)
+            frame._set_full(denoised_full)
         return frame
 
     def to(self, device: str | torch.device) -> "Frame":
         """This frame with all its tensors on ``device``."""
-        frame = self.with_denoised(self.denoised) if self.denoised is not None else self
-        for name in (*_CHANNELS, "denoised_full", "sub_images", "denoised_sub_images"):
-            value = getattr(self, name)
-            if isinstance(value, tuple):
-                object.__setattr__(frame, name, tuple(tensor.to(device) for tensor in value))
-            elif value is not None:
-                object.__setattr__(frame, name, value.to(device))
+        frame = self._copy()
+        for buffer in BUFFERS:
+            if (pair := getattr(self, buffer.name)) is not None:
+                object.__setattr__(frame, buffer.name, tuple(tensor.to(device) for tensor in pair))
+        if self.denoised_full is not None:
+            object.__setattr__(frame, _DENOISED_FULL, self.denoised_full.to(device))
+        moved = [
+            Candidate(c.name, (c.halves[0].to(device), c.halves[1].to(device)), c.full.to(device)) for c in self.more
+        ]
+        object.__setattr__(frame, "more", tuple(moved))
+        return frame
+
+    def _copy(self) -> "Frame":
+        frame = object.__new__(Frame)
+        for name, value in vars(self).items():
+            object.__setattr__(frame, name, value)
+        object.__setattr__(frame, "repairs", dict(self.repairs))
         return frame
 
     def like_input(self, image: Tensor) -> Any:
@@ -227,34 +227,33 @@ def mean(pair: Pair) -> Tensor:
     return average
 
 
-def repaired(image: Any, what: str) -> Tensor:
-    """An (H, W, 3) array as float32, filled where it is not finite; negative values stay.
+def checked(
+    buffer: Buffer, arrays: tuple[Any, ...], names: list[str], size: tuple[int, int] | None
+) -> tuple[tuple[Tensor, ...], Repairs]:
+    """Arrays that hold a buffer, as finite tensors of one size, and how many pixels were repaired.
+
+    Args:
+        buffer: which.
+        arrays: NumPy or torch, (H, W, C).
+        names: what messages call each.
+        size: height and width to have; None takes those of the first.
 
     Raises:
-        FrameError: it has another shape or no floating-point numbers; ``what`` names it.
+        FrameError: a size or channel count does not fit.
     """
-    return _repair(_as_tensor(image, what, 3, half=False), radiance=False)[0]
-
-
-def _names(name: str) -> tuple[str, ...]:
-    """What the arrays of a buffer are called."""
-    if name == "denoised_full":
-        return (name,)
-    if name.endswith("sub_images"):
-        return tuple(f"{name} of half {half}, {which}" for half in "ab" for which in ("first", "second"))
-    return tuple(f"{name} of half {half}" for half in "ab")
-
-
-def _check_sub_images(half: str, color: Tensor, pair: tuple[Tensor, Tensor]) -> None:
-    """Raise where the sub-images have another mean than their half."""
-    found = mean(pair)
-    differing = ((found - color).abs() > _SUB_IMAGE_TOLERANCE * found.abs() + 1e-6).any(-1)
-    share = float(differing.float().mean())
-    if share > _SUB_IMAGE_PIXELS:
-        raise FrameError(
-            f"expected two sub-images whose mean is half {half}, but got others at {share:.0%} of its pixels; "
-            "give the two renders of half a, then those of half b"
-        )
+    tensors, counts = [], Repairs(0, 0)
+    for what, array in zip(names, arrays, strict=True):
+        tensor = as_tensor(array, what, buffer.channels, half=buffer.kind == "feature")
+        if size is not None and tensor.shape[:2] != size:
+            raise FrameError(
+                f"expected {what} of {size[1]}x{size[0]} pixels like the colour of half a, "
+                f"but got {tensor.shape[1]}x{tensor.shape[0]}"
+            )
+        size = (tensor.shape[0], tensor.shape[1])
+        tensor, repairs = repair(tensor, radiance=buffer.kind == "radiance")
+        tensors.append(tensor)
+        counts = Repairs(*(x + y for x, y in zip(counts, repairs, strict=True)))
+    return tuple(tensors), counts
 
 
 def _empty_like(array: Any) -> Any:
@@ -265,53 +264,3 @@ def _empty_like(array: Any) -> Any:
 def _at_most(image: Tensor, limit: float) -> Tensor:
     """Clamped; not copied where there is nothing to do."""
     return image if limit >= torch.finfo(image.dtype).max else image.clamp(max=limit)
-
-
-def _as_tensor(array: Any, what: str, channels: int, *, half: bool) -> Tensor:
-    if isinstance(array, Tensor):
-        tensor = array.detach()
-    else:
-        values = np.asarray(array)
-        tensor = torch.from_numpy(np.array(values, dtype=values.dtype.newbyteorder("="), order="C"))
-    if not tensor.is_floating_point():
-        raise FrameError(f"expected {what} as floating-point numbers, but got {tensor.dtype}")
-    if tensor.ndim == 2 and channels == 1:
-        tensor = tensor[:, :, None]
-    if tensor.ndim != 3 or tensor.shape[2] != channels or 0 in tensor.shape:
-        raise FrameError(f"expected {what} of shape (H, W, {channels}), but got {tuple(tensor.shape)}")
-    if tensor.dtype == torch.float64:
-        # what float32 cannot hold must not turn into an infinity that the render does not have
-        largest = torch.finfo(torch.float32).max
-        tensor = torch.where(tensor.isfinite(), tensor.clamp(-largest, largest), tensor)
-    return tensor if half and tensor.dtype == torch.float16 else tensor.float()
-
-
-def _repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:
-    finite = image.isfinite().all(-1)
-    broken = int((~finite).sum())
-    if broken:
-        image = _fill(image.float(), finite).to(image.dtype)
-    negative = int((image < 0).any(-1).sum()) if radiance else 0
-    if negative:
-        image = image.clamp(min=0)
-    return image, Repairs(broken, negative)
-
-
-def _fill(image: Tensor, known: Tensor) -> Tensor:
-    """Fill unknown pixels from the known ones around them, nearer ones first (push-pull); all unknown gives 0."""
-    weight = known.to(image.dtype)[None, None]
-    value = torch.where(known[..., None], image, 0.0).permute(2, 0, 1)[None]
-    filled = _push_pull(value, weight)[0].permute(1, 2, 0)
-    return torch.where(known[..., None], image, filled)
-
-
-def _push_pull(value: Tensor, weight: Tensor) -> Tensor:
-    """``value`` is already zero where ``weight`` is; returns it with the gaps filled from coarser levels."""
-    if min(value.shape[-2:]) == max(value.shape[-2:]) == 1 or bool(weight.all()):
-        return value
-    coarse_weight = F.avg_pool2d(weight, 2, ceil_mode=True, count_include_pad=False)
-    coarse_value = F.avg_pool2d(value, 2, ceil_mode=True, count_include_pad=False)
-    known = coarse_weight > 0
-    coarse = torch.where(known, coarse_value / coarse_weight.clamp(min=1e-12), 0.0)
-    filled = F.interpolate(_push_pull(coarse, known.to(weight.dtype)), size=value.shape[-2:], mode="nearest")
-    return torch.where(weight > 0, value, filled)

@@ -5,10 +5,11 @@ been. For the blend z + α (g − z) the error is a parabola in α whose two coe
 
     n = w (y^b − z^a)·(g^a − z^a),   d = w ‖g^a − z^a‖²,   w = 1 / (mean_rgb(z)² + 0.01)
 
-averaged over pixels and summed over both directions; its minimum is α = n / d. Locally n is mostly noise, and a single
-firefly in the witness can turn its sign. So the evidence is pooled from coarse to fine: the whole frame first, then
-tiles of 128, 64, 32 and 16 pixels. Each level starts from what the level above found, moves as far as its own evidence
-is certain, and then takes off one standard error.
+averaged over pixels and summed over both directions; its minimum is α = n / d. With several candidates g_k there is an
+n_k of each and a d_km of each two, and the weights α_k ≥ 0 are those of a small least-squares problem. Locally n is
+mostly noise, and a single firefly in the witness can turn its sign. So the evidence is pooled from coarse to fine: the
+whole frame first, then tiles of 128, 64, 32 and 16 pixels. Each level starts from what the level above found, moves as
+far as its own evidence is certain, and then takes off one standard error.
 
 The image is gone through in bands of rows (:mod:`selfcorrect.image.bands`): only n and d are kept for every pixel,
 the rest as means over tiles of 16 pixels. Standard errors are taken over these tiles: evidence inside one may be
@@ -18,7 +19,7 @@ Measured with `scripts/bench/quality.py`; README has the numbers.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -29,12 +30,14 @@ from torch import Tensor
 from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
 from selfcorrect.image.exposure import Radiance
 
-__all__ = ["Estimate", "Evidence", "Guarded", "guard", "keep_light"]
+__all__ = ["Estimate", "Evidence", "Guarded", "guard", "keep_light_"]
 
 _LEVELS = (128, 64, 32, 16)  # sides of the tiles
 _PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
+_SWEEPS = 16  # over several candidates
+_FLOOR = torch.finfo(torch.float64).tiny
 _LARGEST_SCALE = 1.02  # of the whole image, to keep its light
 _BIAS_SHRINKS = 0.45  # how much of the denoiser's change with the noise is taken for a change of its bias
 
@@ -75,34 +78,39 @@ class Guarded:
     Attributes:
         image: (H, W, 3), linear radiance.
         estimate: of what was gained.
-        tiles: α, and the relative squared error before and after, over tiles of 16 pixels, (3, h, w).
+        alpha: the weight of each candidate over tiles of 16 pixels, (K, h, w).
+        errors: the relative squared error before and after over the same, (2, h, w).
     """
 
     image: Tensor
     estimate: Estimate
-    tiles: Tensor
+    alpha: Tensor
+    errors: Tensor
 
     def maps(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Each (H, W): the weight of the corrected image, 0 … 1, and the estimated relative squared error of the
+        """Each (H, W): the weight of all candidates together, 0 … 1, and the estimated relative squared error of the
         denoised image and of the blend, smoothed over 16 pixels.
         """
-        alpha, before, after = enlarged(self.tiles, (self.image.shape[0], self.image.shape[1])).clamp_(min=0)
+        tiles = torch.cat([self.alpha.sum(0, keepdim=True), self.errors])
+        alpha, before, after = enlarged(tiles, (self.image.shape[0], self.image.shape[1])).clamp_(min=0)
         return alpha, before, after
 
 
 class Evidence:
-    """n and d of both directions at every pixel, gathered as the corrected halves are inferred.
+    """n and d of both directions at every pixel, gathered as the candidates' halves are made.
 
     Args:
         color: noisy halves, (H, W, 3) each, linear radiance of a mean near 1.
         denoised: denoised halves.
+        candidates: how many images may be blended in, K.
     """
 
-    def __init__(self, color: Pair, denoised: Pair):
-        self.color, self.denoised = color, denoised
+    def __init__(self, color: Pair, denoised: Pair, candidates: int = 1):
+        self.color, self.denoised, self.candidates = color, denoised, candidates
         self.size = (color[0].shape[0], color[0].shape[1])
         self._usual = [tile_means(self.size[0], partial(_log_level, half)) for half in denoised]
-        self._nd = torch.zeros(2, 2, *self.size, device=self._usual[0].device)  # direction, n or d
+        planes = candidates + candidates * (candidates + 1) // 2
+        self._nd = torch.zeros(2, planes, *self.size, device=self._usual[0].device)  # direction, n or d
         self._rows = 0
 
     @property
@@ -110,8 +118,8 @@ class Evidence:
         """Whether every row has been gathered."""
         return self._rows == self.size[0]
 
-    def add(self, rows: slice, corrected: tuple[Tensor, Tensor]) -> None:
-        """Gather from rows of the halves, each corrected with its own denoised half.
+    def add(self, rows: slice, *halves: tuple[Tensor, Tensor]) -> None:
+        """Gather from rows of the halves of every candidate, each made with its own denoised half.
 
         No half may have seen its witness but through the network's 20,303 weights.
         """
@@ -120,10 +128,12 @@ class Evidence:
             band = slice(rows.start + part.start, rows.start + part.stop)
             y, z = self.y(band), self.z(band)
             for i in (0, 1):
-                change = corrected[i][part].double() - z[i]
-                weight = self.weight(i, band)
-                self._nd[i, 0, band] = weight * ((y[1 - i] - z[i]) * change).mean(-1)
-                self._nd[i, 1, band] = weight * (change**2).mean(-1)
+                changes = [pair[i][part].double() - z[i] for pair in halves]
+                weight, residual = self.weight(i, band), y[1 - i] - z[i]
+                products = [residual * change for change in changes]
+                products += [changes[k] * changes[m] for k, m in _pairs(self.candidates)]
+                for plane, product in enumerate(products):
+                    self._nd[i, plane, band] = weight * product.mean(-1)
 
     def y(self, rows: slice) -> list[Tensor]:
         """The noisy halves."""
@@ -134,7 +144,7 @@ class Evidence:
         return [half[rows].double() for half in self.denoised]
 
     def nd(self, i: int, rows: slice) -> Tensor:
-        """n and d of one direction, (2, rows, W)."""
+        """n of each candidate and d of each two of them, of one direction, (K + K (K + 1) / 2, rows, W)."""
         return self._nd[i, :, rows].double()
 
     def both(self, rows: slice) -> Tensor:
@@ -156,25 +166,41 @@ def _log_level(radiance: Radiance, rows: slice) -> Tensor:
     return radiance[rows].double().mean(-1).clamp(min=_DARKEST).log()[None]
 
 
-def guard(evidence: Evidence, denoised_full: Radiance, image: Tensor, *, scale: float = 1.0) -> Guarded:
-    """Blend the corrected image into the denoised one as far as the halves bear it out.
+def _pairs(candidates: int) -> list[tuple[int, int]]:
+    """The order in which d of each two candidates is kept.
+
+    >>> _pairs(2)
+    [(0, 0), (0, 1), (1, 1)]
+    """
+    return [(k, m) for k in range(candidates) for m in range(k, candidates)]
+
+
+def _place(k: int, m: int, candidates: int) -> int:
+    """Where d of two candidates is among those of :func:`_pairs`."""
+    return _pairs(candidates).index((min(k, m), max(k, m)))
+
+
+def guard(
+    evidence: Evidence, denoised_full: Radiance, images: Sequence[Radiance], *, scale: float = 1.0, out: Tensor
+) -> Guarded:
+    """Blend candidates into the denoised image as far as the halves bear them out.
 
     Args:
         evidence: of every row.
         denoised_full: denoised mean of the halves.
-        image: the corrected image to blend in, (H, W, 3); it becomes the blend, in place.
+        images: each candidate of the full buffer, (H, W, 3).
         scale: what the radiance was multiplied by; the estimate is that of the frame before.
+        out: (H, W, 3), what the blend is written to; it may be the last of ``images``.
     """
-    size = evidence.size
-    chosen = [_pooled(size, partial(evidence.nd, i)) for i in (0, 1)]
+    size, count = evidence.size, evidence.candidates
+    chosen = [_pooled(size, partial(evidence.nd, i), count) for i in (0, 1)]
 
     def judged(rows: slice) -> tuple[Tensor, Tensor]:
         """What one direction alone would choose is judged by the witness of the other: the gain, with and without w."""
         gain, unweighted = [], []
         for i in (0, 1):
-            alpha = enlarged_rows(chosen[i], size, rows)[0]
-            n, d = evidence.nd(1 - i, rows)
-            gain.append(alpha * n - alpha**2 * d / 2)
+            alpha, nd = enlarged_rows(chosen[i], size, rows), evidence.nd(1 - i, rows)
+            gain.append(_gain(alpha, nd))
             unweighted.append(gain[i] / evidence.weight(1 - i, rows))
         return gain[0] + gain[1], unweighted[0] + unweighted[1]
 
@@ -186,10 +212,13 @@ def guard(evidence: Evidence, denoised_full: Radiance, image: Tensor, *, scale: 
     # More than chance, in the weights that decide and in those of the metric.
     improved = all(mean > _standard_error(tiles) for mean, tiles in zip(average(gain, size), gain, strict=True))
 
-    alpha = _pooled(size, evidence.both) if improved else torch.zeros_like(gain[:1, :1, :1])
+    alpha = _pooled(size, evidence.both, count) if improved else gain.new_zeros(count, 1, 1)
     for rows in bands(size[0]):
-        full = denoised_full[rows].double()
-        image[rows] = full + enlarged_rows(alpha, size, rows)[0, :, :, None] * (image[rows].double() - full)
+        full, weights = denoised_full[rows].double(), enlarged_rows(alpha, size, rows)
+        blend = full
+        for weight, image in zip(weights, images, strict=True):
+            blend = blend + weight[:, :, None] * (image[rows].double() - full)
+        out[rows] = blend
 
     def squares(rows: slice) -> Tensor:
         """Mean squared differences, and the gain, by which :func:`_estimate` knows errors."""
@@ -201,10 +230,21 @@ def guard(evidence: Evidence, denoised_full: Radiance, image: Tensor, *, scale: 
         gained = judged(rows)[1] if improved else torch.zeros_like(spread)
         # The best image there is says what errors are relative to: where the denoiser has left fireflies or blurred
         # a lamp, its own radiance would hide its error.
-        return _metric_weight(_shown(image, rows), scale) * torch.stack([between, crossed, spread, nonlinear, gained])
+        return _metric_weight(_shown(out, rows), scale) * torch.stack([between, crossed, spread, nonlinear, gained])
 
     estimate, errors = _estimate(tile_means(size[0], squares), size, improved)
-    return Guarded(image, estimate, torch.cat([alpha.expand(1, *errors.shape[1:]), errors]))
+    return Guarded(out, estimate, alpha.expand(count, *errors.shape[1:]), errors)
+
+
+def _gain(alpha: Tensor, nd: Tensor) -> Tensor:
+    """What weights α take off half the squared error: Σ_k α_k n_k − Σ_kl α_k α_l d_kl / 2."""
+    count = len(alpha)
+    gain = alpha[0] * nd[0]
+    for k in range(1, count):
+        gain = gain + alpha[k] * nd[k]
+    for (k, m), d in zip(_pairs(count), nd[count:], strict=True):
+        gain = gain - alpha[k] * alpha[m] * d / (2 if k == m else 1)
+    return gain
 
 
 def _metric_weight(radiance: Tensor, scale: float) -> Tensor:
@@ -250,27 +290,53 @@ def _estimate(squares: Tensor, size: tuple[int, int], improved: bool) -> tuple[E
     return estimate, torch.stack([before, after])
 
 
-def _pooled(size: tuple[int, int], nd: Callable[[slice], Tensor]) -> Tensor:
-    """α over the smallest tiles, (1, h, w), from evidence pooled over the frame, then over ever smaller tiles."""
-    floor = torch.finfo(torch.float64).tiny
+def _pooled(size: tuple[int, int], nd: Callable[[slice], Tensor], count: int) -> Tensor:
+    """α over the smallest tiles, (K, h, w), from evidence pooled over the frame, then over ever smaller tiles."""
     tiles = tile_means(size[0], nd)
-    n, d = average(tiles, size)
-    alpha = tiles.new_tensor((n - _standard_error(tiles[0])) / max(d, floor)).clamp(0, 1).reshape(1, 1, 1)
+    means = tiles.new_tensor(average(tiles, size)).reshape(-1, 1, 1)
+    chance = tiles.new_tensor([_standard_error(n) for n in tiles[:count]]).reshape(-1, 1, 1)
+    nothing = torch.zeros_like(chance)
+    alpha = _solved(means[:count], means[count:], nothing, nothing, chance)
     for side in _LEVELS:
         if side > max(size):
             continue
-        evidence, curvature, around, scatter = tile_means(size[0], partial(_moments, size, nd, alpha), side)
+        moments = tile_means(size[0], partial(_moments, size, nd, alpha), side)
+        n, d, around, scatter = moments.split([count, len(means) - count, count, count])
         variance = scatter / side**2
-        ridge = variance / (_PRIOR_VARIANCE * curvature).clamp(min=floor)
-        moved = (evidence + ridge * around - variance.sqrt()) / (curvature + ridge).clamp(min=floor)
-        alpha = moved.clamp(0, 1)[None]
+        curvature = torch.stack([d[_place(k, k, count)] for k in range(count)])
+        ridge = variance / (_PRIOR_VARIANCE * curvature).clamp(min=_FLOOR)
+        alpha = _solved(n, d, around, ridge, variance.sqrt())
     return alpha
+
+
+def _solved(n: Tensor, d: Tensor, around: Tensor, ridge: Tensor, chance: Tensor) -> Tensor:
+    """The α ≥ 0 of sum ≤ 1 at which Σ α_k n_k − Σ α_k α_m d_km / 2 − Σ ridge_k (α_k − around_k)² / 2 is largest.
+
+    One after the other, each is moved to where the others leave it; less its chance, one standard error of n.
+    """
+    count = len(n)
+    alpha = list(around)
+    for k in list(range(count)) * (1 if count == 1 else _SWEEPS):
+        left, share = n[k], torch.ones_like(n[k])
+        for m in range(count):
+            if m != k:
+                left = left - alpha[m] * d[_place(k, m, count)]
+                share = share - alpha[m]
+        curvature = (d[_place(k, k, count)] + ridge[k]).clamp(min=_FLOOR)
+        moved = (left + ridge[k] * around[k] - chance[k]) / curvature
+        alpha[k] = torch.minimum(moved.clamp(min=0), share.clamp(min=0))
+    return torch.stack(alpha)
 
 
 def _moments(size: tuple[int, int], nd: Callable[[slice], Tensor], alpha: Tensor, rows: slice) -> Tensor:
     """What a level needs the means of: n, d, the α of the level above, and the squared rest that this α leaves."""
-    (n, d), around = nd(rows), enlarged_rows(alpha, size, rows)[0]
-    return torch.stack([n, d, around, (n - around * d) ** 2])
+    evidence, around = nd(rows), enlarged_rows(alpha, size, rows)
+    count = len(alpha)
+    rest = [evidence[k] for k in range(count)]
+    for k in range(count):
+        for m in range(count):
+            rest[k] = rest[k] - around[m] * evidence[count + _place(k, m, count)]
+    return torch.cat([evidence, around, torch.stack(rest) ** 2])
 
 
 def _standard_error(tiles: Tensor) -> float:
@@ -280,7 +346,7 @@ def _standard_error(tiles: Tensor) -> float:
     return float(tiles.std()) / math.sqrt(tiles.numel())
 
 
-def keep_light(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:
+def keep_light_(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:
     """Bring the image's mean radiance to within three standard errors of the noisy mean, in place.
 
     Corrections learned from a loss that has not seen every bright path lose light; the noisy mean has not. Small

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from selfcorrect.errors import SettingsError
 
-__all__ = ["Settings"]
+__all__ = ["STAGE_NAMES", "Settings"]
 
 _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench/quality.py measures it"
@@ -41,18 +41,14 @@ def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) ->
         raise SettingsError(f"expected {name} of at least {metadata['least']}, but got {value!r}")
 
 
-STAGES = ("regression", "core", "james-stein", "neural-james-stein", "deep-combiner", "deep-combiner-4")
+STAGE_NAMES = ("regression", "core", "james-stein", "neural-james-stein", "deep-combiner", "deep-combiner-4")
 
 
 def _check_stages(stages: str) -> None:
     names = stages.split(",")
-    unknown = [name for name in names if name not in STAGES]
+    unknown = [name for name in names if name not in STAGE_NAMES]
     if unknown or len(set(names)) < len(names):
-        raise SettingsError(f"expected stages out of {','.join(STAGES)}, each at most once, but got {stages!r}")
-    if "deep-combiner-4" in names[1:]:
-        raise SettingsError(
-            f"expected deep-combiner-4 as the first stage, as it reads what the denoiser gave, but got {stages!r}"
-        )
+        raise SettingsError(f"expected stages out of {','.join(STAGE_NAMES)}, each at most once, but got {stages!r}")
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,9 @@ class Settings:
         SettingsError: a value is out of range.
     """
 
-    stages: str = _setting("core", f"what runs, in this order, before the guard: out of {','.join(STAGES)}", _STAGES)
+    stages: str = _setting(
+        "core", f"what runs, in this order, before the guard: out of {','.join(STAGE_NAMES)}", _STAGES
+    )
     regression_stride: int = _setting(
         2, "the stage regression solves a model at every so many-th pixel of as many rows", _STAGES, least=1
     )

@@ -152,8 +152,8 @@ def test_the_default_preset_guards_and_estimates() -> None:
     result = correct(frame, settings)
     assert result.estimate is not None
     assert result.estimate.improved
-    assert set(result.aovs) == {"blend", "error.before", "error.after"}
-    assert all(map.shape == (64, 80) for map in result.aovs.values())
+    assert set(result.maps) == {"blend", "error.before", "error.after"}
+    assert all(map.shape == (64, 80) for map in result.maps.values())
     truth = 0.5 + 0.4 * np.sin(np.arange(80) * 1.5)[None, :, None]
     before = float(np.mean((0.5 - truth) ** 2))
     assert np.mean((result.image - truth) ** 2) < 0.5 * before
@@ -190,7 +190,7 @@ def test_tensors_in_tensors_out() -> None:
 
 def test_the_road_of_other_devices_gives_the_same_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a device without the compiled kernel runs: the reference as a shift loop gives the same frame."""
-    from selfcorrect import kernel
+    from selfcorrect.kernel import cross_bilateral as kernel
 
     settings = Settings.from_dict(SMALL.to_dict() | {"window": 3})
     compiled = correct(make_frame(), settings).image

@@ -50,7 +50,7 @@ def assert_same_but_for(factor: float, frame: Frame, preset: Settings) -> None:
     expected, got = corrected(through(kept), preset), corrected(through(times), preset)
     image = plain(expected.image)
     assert np.abs(plain(got.image) / factor - image).max() < EQUIVARIANCE * image.mean()
-    torch.testing.assert_close(got.aovs["blend"], expected.aovs["blend"], rtol=0, atol=EQUIVARIANCE)
+    torch.testing.assert_close(got.maps["blend"], expected.maps["blend"], rtol=0, atol=EQUIVARIANCE)
 
 
 # --- Generated frames ---------------------------------------------------------------------------------------------

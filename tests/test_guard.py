@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from selfcorrect.guard import Evidence, Guarded, Pair, keep_light
+from selfcorrect.guard import Evidence, Guarded, Pair, keep_light_
 from selfcorrect.guard import guard as guard_by_evidence
 from selfcorrect.image import bands
 from selfcorrect.stages.core.trust import trust_in_full
@@ -45,7 +45,8 @@ def guard(color: Pair, denoised: Pair, corrected: Halves, full: Tensor, image: T
     """The guard on whole corrected halves."""
     evidence = Evidence(color, denoised)
     evidence.add(slice(0, image.shape[0]), corrected)
-    return guard_by_evidence(evidence, full, image.clone(), scale=scale)
+    blend = image.clone()
+    return guard_by_evidence(evidence, full, [blend], scale=scale, out=blend)
 
 
 def error(image: Tensor, truth: Tensor) -> float:
@@ -132,17 +133,17 @@ def test_light_is_kept() -> None:
     mean = float((color[0] + color[1]).mean() / 2)
     certainty = 0.1 / 2**0.5 / (SIZE[0] * SIZE[1] * 3) ** 0.5
     for factor in (0.985, 1.015):
-        kept = keep_light(scene() * factor, scene() * factor, color)
+        kept = keep_light_(scene() * factor, scene() * factor, color)
         assert float(kept.mean()) == pytest.approx(mean, abs=3.2 * certainty)
     for factor in (0.8, 1.2):
-        kept = keep_light(scene() * factor, scene(), color)
+        kept = keep_light_(scene() * factor, scene(), color)
         assert float(kept.mean()) == pytest.approx(mean, abs=3.2 * certainty), "the denoised image has kept the light"
-        alone = keep_light(scene() * factor, scene() * factor, color)
+        alone = keep_light_(scene() * factor, scene() * factor, color)
         change = float(alone.mean() / scene().mean()) / factor
         assert change == pytest.approx(1.02 if factor < 1 else 1 / 1.02, rel=1e-4), "never scaled by more"
-    assert torch.equal(keep_light(scene(), scene(), color), scene())
+    assert torch.equal(keep_light_(scene(), scene(), color), scene())
     black = torch.zeros(*SIZE, 3)
-    assert torch.equal(keep_light(black, scene(), color), black)
+    assert torch.equal(keep_light_(black, scene(), color), black)
 
 
 @pytest.mark.parametrize("improves", [True, False])
@@ -164,7 +165,7 @@ def test_bands_of_rows_give_what_the_whole_image_gives(improves: bool, monkeypat
     def run() -> tuple[Guarded, Tensor, Tensor]:
         guarded = guard(color, denoised, corrected, full, image, scale=0.7)
         trusted = torch.cat([trust_in_full(denoised, full, rows) for rows in bands.bands(size[0])])
-        return guarded, trusted, keep_light(0.9 * guarded.image, full, color)
+        return guarded, trusted, keep_light_(0.9 * guarded.image, full, color)
 
     (banded, trusted, lit), _ = run(), monkeypatch.setattr(bands, "_BAND", 1024)
     whole, trusted_whole, lit_whole = run()

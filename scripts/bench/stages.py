@@ -28,11 +28,11 @@ from quality import load
 import denoisers
 from selfcorrect import Frame, Settings, correct, metrics
 from selfcorrect.frame import mean
-from selfcorrect.settings import STAGES
-from selfcorrect.stages import steps
+from selfcorrect.stages import STAGES
+from selfcorrect.stages.images import StageImages
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
 from selfcorrect.stages.regression import cross_buffer_regression
-from selfcorrect.stages.steps import StageImages
+from selfcorrect.stages.stage import Work
 
 COMPOSITIONS = (
     *("core", "james-stein", "core,james-stein", "regression", "regression,james-stein"),
@@ -172,8 +172,8 @@ def work(stage: str, frame: Frame, threads: int) -> Callable[[], object]:
     name, _, stride = stage.partition(", stride ")
     settings = Settings.preset("balanced", **({"regression_stride": int(stride)} if stride else {}))
     state = StageImages(frame.halves, mean(frame.denoised))
-    step = {"regression": steps.regress, "james-stein": steps.james_stein}[name]
-    return lambda: step(state, settings)
+    step = STAGES[name](settings)
+    return lambda: step.run(state, Work())
 
 
 def peak() -> float:

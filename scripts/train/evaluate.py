@@ -17,6 +17,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,8 +29,9 @@ import denoisers
 from selfcorrect import Frame, Settings, correct, metrics
 from selfcorrect.errors import FileError
 from selfcorrect.frame import mean
-from selfcorrect.stages import weights
+from selfcorrect.stages import opened, weights
 from selfcorrect.stages.core.network import Network
+from selfcorrect.stages.deep_combiner_4 import SubImages
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
 
@@ -57,6 +59,7 @@ class Case(NamedTuple):
     spp: int
     frame: Frame
     references: References
+    sub_images: SubImages | None = None
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -79,7 +82,7 @@ def available(method: str) -> bool:
         if method == "onnx":
             denoisers.create("onnx")
         elif method in STAGES:
-            weights.check(Settings.preset("balanced", stages=method.removeprefix("box,")))
+            opened(Settings.preset("balanced", stages=method.removeprefix("box,")))
     except FileError as error:
         print(f"{method} is left out: {error}")
         return False
@@ -110,10 +113,9 @@ def of_view(view: dataset.View) -> Case:
         albedo=(view.albedo, view.albedo),
         normal=(view.normal, view.normal),
         depth=(view.depth, view.depth),
-        sub_images=tuple(inputs[:4]),
-        denoised_sub_images=tuple(images[:4]),
     )
-    return Case(f"views: {view.scene}", view.name, view.spp, frame, (*view.reference, view.smooth))
+    subs = replace(SubImages.of(frame, tuple(inputs[:4])), denoised=tuple(images[:4]))
+    return Case(f"views: {view.scene}", view.name, view.spp, frame, (*view.reference, view.smooth), subs)
 
 
 def measure(case: Case, methods: list[str], options: argparse.Namespace) -> None:
@@ -128,9 +130,9 @@ def measure(case: Case, methods: list[str], options: argparse.Namespace) -> None
         return made[spec]
 
     for method in methods:
-        if method == "deep-combiner-4" and case.frame.sub_images is None:
+        if method == "deep-combiner-4" and case.sub_images is None:
             continue
-        image = result_of(method, case.frame, denoised, networks)
+        image = result_of(method, case, denoised, networks)
         error = metrics.relmse(image, *case.references)
         spread = metrics.relmse_standard_error(image, *case.references)
         radiance = metrics.mean_radiance_ratio(image, mean(case.references[:2]))
@@ -141,12 +143,10 @@ def measure(case: Case, methods: list[str], options: argparse.Namespace) -> None
         print(*row, sep="  ", flush=True)
 
 
-def result_of(
-    method: str, frame: Frame, denoised: Callable[[str], Frame], networks: dict[str, Network | None]
-) -> Tensor:
+def result_of(method: str, case: Case, denoised: Callable[[str], Frame], networks: dict[str, Network | None]) -> Tensor:
     """A method's image; the core is trained once for each image it gets, and kept in ``networks``."""
     if method == "noisy":
-        return mean(frame.color)
+        return mean(case.frame.color)
     if method in DENOISERS:
         image = denoised(method).denoised_full
         assert isinstance(image, Tensor)  # denoise() makes one
@@ -159,7 +159,8 @@ def result_of(
     settings = Settings.preset(
         "balanced", stages=stages, guard=bool(core), **({"steps": 0, "epochs": 0} if core else {})
     )
-    result: Tensor = correct(given, settings, warm_start=networks[before] if core else None).image
+    extra = {"deep-combiner-4": case.sub_images}
+    result: Tensor = correct(given, settings, warm_start=networks[before] if core else None, extra=extra).image
     return result
 
 

@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"largest difference between onnxruntime and torch: {difference(network, path, options.frame):.3g}")
     else:
         weights.save(path, network, settings=facts, data=settings["data"], attribution=ATTRIBUTION)
-        weights.load(path)
+        weights.load(path, type(network))
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, {facts['hours']} h, {facts['steps']} steps")
 
 

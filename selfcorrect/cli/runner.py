@@ -15,14 +15,13 @@ import torch
 from tqdm import tqdm
 
 import denoisers
-from selfcorrect import files
+from selfcorrect import files, stages
 from selfcorrect.correct import Result, correct
 from selfcorrect.errors import SettingsError
 from selfcorrect.exr.file import OUTPUT
 from selfcorrect.frame import Frame
 from selfcorrect.independence import doubts
 from selfcorrect.settings import Settings
-from selfcorrect.stages import weights
 from selfcorrect.stages.core.network import Network
 
 __all__ = [
@@ -165,7 +164,7 @@ class Runner:
         if options.aov and not self.settings.guard:
             aov = ",".join(options.aov)
             raise SettingsError(f"expected the guard with --aov {aov}, but got settings that turn it off")
-        weights.check(self.settings)
+        self._stages = stages.opened(self.settings)
         _check_sub_images(options, self.settings, given=given)
         _use_machine(options)
         self._options = options
@@ -213,6 +212,7 @@ class Runner:
                 warm_start=network,
                 progress=progress,
                 stop=stop,
+                opened=self._stages,
             )
         return Corrected(loaded.origin, _facts(frame, result), result, denoiser, began, seconds)
 
@@ -258,8 +258,11 @@ class Runner:
             "start": result.start._asdict(),
             **more,
         }
-        extra = _extra(self._options, result)
-        clipped = files.save(output, corrected.origin, result, settings=self.settings, details=details, extra=extra)
+        attributes = {
+            "selfcorrect/settings": json.dumps(self.settings.to_dict()),
+            "selfcorrect/run": json.dumps(details),
+        }
+        clipped = files.save(output, corrected.origin, _outputs(self._options, result), attributes)
         lines = [] if result.estimate is None else [str(result.estimate)]
         if clipped:
             lines.append(f"{output}: {clipped} values beyond the range of half floats were clipped")
@@ -328,13 +331,10 @@ def _spent(result: Result) -> str:
     return ", ".join(f"{name} {value:.1f} s" for name, value in result.seconds.items())
 
 
-def _extra(options: argparse.Namespace, result: Result) -> dict[str, Any]:
-    """The maps that --aov asks for, as channels."""
-    return {
-        f"selfcorrect.{name}": image.cpu().numpy()
-        for name, image in result.aovs.items()
-        if name.partition(".")[0] in options.aov
-    }
+def _outputs(options: argparse.Namespace, result: Result) -> dict[str, Any]:
+    """The corrected colour, and the maps that --aov asks for."""
+    maps = {name: image.cpu().numpy() for name, image in result.maps.items()}
+    return {"color": result.image} | {name: map for name, map in maps.items() if name.partition(".")[0] in options.aov}
 
 
 def _aov_names(text: str) -> list[str]:

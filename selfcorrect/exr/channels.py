@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from selfcorrect.buffers import COLOR, FEATURES
 from selfcorrect.errors import ChannelError, SettingsError
 
 __all__ = [
@@ -29,7 +30,7 @@ __all__ = [
     "siblings",
 ]
 
-ROLES = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "visibility": 1, "alpha": 1}
+ROLES = {buffer.name: buffer.channels for buffer in (COLOR, *FEATURES)} | {"alpha": 1}
 """Every role and its number of channels."""
 
 _RGB = (".R", ".G", ".B")

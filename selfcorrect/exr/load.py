@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcorrect.buffers import FEATURES
 from selfcorrect.errors import FrameError
 from selfcorrect.exr import channels
 from selfcorrect.exr.file import ExrFile, Pixels, float_type, read
@@ -15,7 +16,7 @@ from selfcorrect.exr.header import Window
 
 __all__ = ["HalfFile", "load_half"]
 
-_FEATURES = {"albedo", "normal", "visibility", "depth"}
+_FEATURES = {feature.name for feature in FEATURES}
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from selfcorrect.image.bands import bands
 
-__all__ = ["LARGEST", "Radiance", "Scaled", "scaled"]
+__all__ = ["LARGEST", "Radiance", "Scaled", "scale_"]
 
 LARGEST = 1e15  # keeps squared differences in a window finite in float32
 
@@ -36,7 +36,7 @@ class Scaled:
         return (self._image[rows].double() * self._factor).clamp(max=LARGEST).float()
 
 
-def scaled(image: Tensor, factor: float) -> Tensor:
+def scale_(image: Tensor, factor: float) -> Tensor:
     """Radiance times a factor, in place; bounded by what float32 holds."""
     largest = torch.finfo(torch.float32).max
     for rows in bands(image.shape[0]):

@@ -5,16 +5,26 @@ and 15): ``β_c = z_c + Σ w_i (y_i − z_i) / W``. With several buffers the sum
 so that an outlier in one buffer loses its weight to the same pixel in the others.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
+from selfcorrect.errors import FileError
+from selfcorrect.frame import Half, mean
+from selfcorrect.image.exposure import LARGEST, scale_
+from selfcorrect.image.tiles import Region, tiles
 from selfcorrect.image.windows import reflected
+from selfcorrect.settings import Settings
+from selfcorrect.stages.images import StageImages
 from selfcorrect.stages.layers import convolution, start_flat, tau
+from selfcorrect.stages.stage import Outcome, Stage, Work
 from selfcorrect.stages.taps import windowed_sum
+from selfcorrect.stages.tiled import SIDE, around, autocast, cut, slices
+from selfcorrect.stages.weights import TrainedNetwork, of_stage
 
-__all__ = ["DeepCombiner", "combined", "feature_planes"]
+__all__ = ["DeepCombiner", "DeepCombinerStage", "combine_whole", "combined", "feature_planes", "opened_network"]
 
 _FEATURES = 7  # normal, albedo, depth
 _FIRST_ANCHOR = 4  # of the window's weights together: training starts near the denoised image
@@ -22,7 +32,7 @@ _LEAST_SUM = 1e-10  # as published
 _BEYOND = 1e9  # depth from here on is a renderer's word for nothing hit (Blender's is 1e10)
 
 
-class DeepCombiner(nn.Module):
+class DeepCombiner(TrainedNetwork):
     """Six convolutions 5×5 of 100 filters and kernels of 15×15, ReLU after every layer including the last.
 
     It has one output for each pixel of the window and buffer, the centre among them, as the public code does: 1,595,725
@@ -43,6 +53,8 @@ class DeepCombiner(nn.Module):
             that are normalised without one must take in the residuals' noise everywhere. Not in the paper.
         seed: of the first weights.
     """
+
+    kind = "deep-combiner"
 
     def __init__(
         self,
@@ -65,7 +77,6 @@ class DeepCombiner(nn.Module):
             "kernel": kernel,
             "anchored": anchored,
         }
-        """The arguments that rebuild it."""
         self.pairs, self.window = buffers, window
         self.reach = layers * (kernel // 2)
         """Pixels that a weight sees on each side."""
@@ -139,3 +150,95 @@ def feature_planes(
             planes = planes.to(buffer.device)
             planes[first : first + buffer.shape[2]] = buffer.permute(2, 0, 1)
     return planes
+
+
+@torch.no_grad()
+def combine_whole(
+    network: DeepCombiner,
+    noisy: Sequence[Tensor],
+    denoised: Sequence[Tensor],
+    features: Tensor,
+    *,
+    scale: float = 1.0,
+    precision: str = "fp32",
+    side: int = SIDE,
+) -> Tensor:
+    """The deep combiner's image, (H, W, 3).
+
+    Args:
+        network: trained, of as many pairs as there are images.
+        noisy: y of each pair, linear radiance, (H, W, 3).
+        denoised: z of each pair.
+        features: (7, H, W), see :func:`feature_planes`.
+        scale: what brings the radiance to a mean near 1.
+        precision: "fp32", or "bf16" for convolutions in bfloat16 where the processor has matrix tiles.
+        side: of the tiles, pixels.
+    """
+
+    def radiance(images: Sequence[Tensor], region: Region, reach: int = 0) -> Tensor:
+        parts = [cut(image.permute(2, 0, 1), region, reach).double() * scale for image in images]
+        return torch.stack(parts).clamp_(-LARGEST, LARGEST).float()
+
+    size, pad = (features.shape[1], features.shape[2]), network.window // 2
+    result = torch.empty_like(noisy[0])
+    for region in tiles(size, side):
+        wide, inside = around(region, network.reach, size)
+        shown = radiance(noisy, wide), radiance(denoised, wide), cut(features, wide)
+        with autocast(features, precision):
+            weights = network.weights(*(planes[None] for planes in shown))[(..., *inside)]
+        residual = radiance(noisy, region, pad) - radiance(denoised, region, pad)
+        tile = combined(weights, residual[None], radiance(denoised, region)[None], network.window)
+        result[slices(region)] = tile[0].permute(1, 2, 0)
+    return scale_(result, 1 / scale)
+
+
+def opened_network(stage: str, settings: Settings, setting: str, packaged: str, *, pairs: int) -> DeepCombiner:
+    """The network of a stage, of so many pairs of a noisy and a denoised image.
+
+    Raises:
+        FileError: weights are missing, do not fit, or are for another number of pairs.
+    """
+    network, path = of_stage(stage, settings, setting, packaged, DeepCombiner)
+    if network.pairs != pairs:
+        raise FileError(f"{path}: expected weights of {stage}, but got those for {network.pairs} denoised images")
+    return network
+
+
+class DeepCombinerStage(Stage):
+    """Each half combined with its image so far, and the mean of both with the full image so far (Eq. 8)."""
+
+    name = "deep-combiner"
+
+    def __init__(self, settings: Settings):
+        super().__init__(settings)
+        self.network = opened_network(DeepCombinerStage.name, settings, "combiner_weights", "deep-combiner", pairs=1)
+
+    def run(self, state: StageImages, work: Work) -> Outcome:
+        """Combine thrice."""
+        a, b = (
+            self.combined(self.network, (half.color,), (image,), (half,), state.scale)
+            for half, image in zip(state.halves, state.images, strict=True)
+        )
+        return Outcome(state.then((a, b), self.full(state, work)))
+
+    def full(self, state: StageImages, work: Work) -> Tensor:
+        """The combined image of both halves."""
+        return self.combined(self.network, (mean(state.color),), (state.full,), state.halves, state.scale)
+
+    def combined(
+        self,
+        network: DeepCombiner,
+        noisy: Sequence[Tensor],
+        denoised: Sequence[Tensor],
+        halves: Sequence[Half],
+        scale: float,
+    ) -> Tensor:
+        """The network's image, with the G-buffers of one half, or the mean of those of both."""
+
+        def feature(name: str) -> Tensor | None:
+            values = [getattr(half, name) for half in halves]
+            return None if values[0] is None else mean((values[0], values[-1]))
+
+        size = (noisy[0].shape[0], noisy[0].shape[1])
+        features = feature_planes(size, normal=feature("normal"), albedo=feature("albedo"), depth=feature("depth"))
+        return combine_whole(network, noisy, denoised, features, scale=scale, precision=self.settings.precision)

@@ -16,9 +16,13 @@ import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
+from selfcorrect.frame import mean
+from selfcorrect.image.exposure import scale_
 from selfcorrect.image.windows import box_mean, gaussian_mean
+from selfcorrect.stages.images import StageImages
+from selfcorrect.stages.stage import Outcome, Stage, Work
 
-__all__ = ["WINDOW", "james_stein", "relative_weight", "variance_of_mean"]
+__all__ = ["WINDOW", "JamesStein", "james_stein", "relative_weight", "variance_of_mean"]
 
 WINDOW = 15  # side of the block Ω; p = 15 · 15 = 225
 SIGMA = 4.0  # pixels, of the Gaussian that smooths the variance: a block's standard deviation, √((15² − 1) / 12) = 4.3
@@ -91,3 +95,24 @@ def _shrinkage(squared: Tensor, variance: Tensor, window: int) -> Tensor:
     p = window**2
     noise, distance = (p - 2) * variance, p * box_mean(squared, window)
     return 1 - torch.where(noise < distance, noise / distance, 1.0)
+
+
+class JamesStein(Stage):
+    """Each half and the full image shrunk from the noisy radiance towards what the stages so far have made (Eq. 13).
+
+    Where a half's noise is large is told by both halves, (y^a − y^b)² / 2, but only as a mean over a block: see
+    ``tests/stages/test_stages.py`` for how little the half thereby knows of its witness.
+    """
+
+    name = "james-stein"
+
+    def run(self, state: StageImages, work: Work) -> Outcome:
+        """Shrink with the relative weight."""
+        scaled = state.scaled()
+        variance = variance_of_mean(scaled.color)
+
+        def shrunk(noisy: Tensor, image: Tensor, variance: Tensor) -> Tensor:
+            return scale_(james_stein(noisy, image, variance, relative_weight(noisy)), 1 / state.scale)
+
+        a, b = (shrunk(noisy, image, 2 * variance) for noisy, image in zip(scaled.color, scaled.images, strict=True))
+        return Outcome(state.then((a, b), shrunk(mean(scaled.color), scaled.full, variance)))

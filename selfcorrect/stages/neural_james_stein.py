@@ -10,15 +10,24 @@ weight of the classical variant here, too. With equal weights and α = ½ the tw
 import torch
 from torch import Tensor, nn
 
+from selfcorrect.frame import mean
+from selfcorrect.image.exposure import scale_
+from selfcorrect.image.tiles import tiles
 from selfcorrect.image.windows import box_mean, reflected
-from selfcorrect.stages.james_stein import WINDOW, relative_weight
+from selfcorrect.settings import Settings
+from selfcorrect.stages.images import StageImages
+from selfcorrect.stages.james_stein import WINDOW, relative_weight, variance_of_mean
 from selfcorrect.stages.layers import convolution, start_flat, tau, to_multiple
+from selfcorrect.stages.stage import Outcome, Stage, Work
 from selfcorrect.stages.taps import windowed_sum
+from selfcorrect.stages.tiled import ALIGNMENT, SIDE, around, autocast, cut, slices
+from selfcorrect.stages.weights import TrainedNetwork, of_stage
 
 __all__ = [
-    "ALIGNMENT",
     "REACH",
+    "NeuralJamesStein",
     "VarianceNetwork",
+    "blend_whole",
     "neural_blend",
     "relative_weights",
     "shrunk",
@@ -26,14 +35,13 @@ __all__ = [
     "tau_loss",
 ]
 
-ALIGNMENT = 4  # pixels; two poolings by 2
 REACH = 24  # pixels that an output sees on each side, 21 and what poolings add, up to a multiple of ALIGNMENT
 _LEAST_WEIGHT = 1e-4  # as published, so that no sum of weights is 0
 _LEAST_VARIANCE = 1e-8  # under the root, whose slope at 0 is infinite
 _EPSILON = 0.01  # of the loss, as published
 
 
-class VarianceNetwork(nn.Module):
+class VarianceNetwork(TrainedNetwork):
     """U-Net of 32-32 | 64-64 | 128-128 | 64-64 | 32-32 filters of 3×3, ReLU, and 226 outputs.
 
     It sees τ(x) = sign(x) ln(1 + |x|) of the radiance and of the standard deviation: fireflies do not leave the range
@@ -43,10 +51,11 @@ class VarianceNetwork(nn.Module):
         seed: of the first weights.
     """
 
+    kind = "james-stein"
+
     def __init__(self, seed: int = 0):
         super().__init__()
-        self.architecture: dict[str, int] = {}
-        """The arguments that rebuild it: its size is as published."""
+        self.architecture = {}  # its size is as published
         generator = torch.Generator().manual_seed(seed)
 
         def pair(inputs: int, outputs: int) -> nn.ModuleList:
@@ -164,3 +173,64 @@ def tau_loss(theta: Tensor, target: Tensor, level: Tensor | None = None) -> Tens
         target = tau(target)
         return ((tau(theta) - target) ** 2 / (target**2 + _EPSILON)).mean()
     return (((theta - target) / (1 + level.abs())) ** 2 / (tau(level) ** 2 + _EPSILON)).mean()
+
+
+@torch.no_grad()
+def blend_whole(
+    network: VarianceNetwork,
+    x: Tensor,
+    variance: Tensor,
+    y_a: Tensor,
+    y_b: Tensor,
+    *,
+    precision: str = "fp32",
+    side: int = SIDE,
+) -> Tensor:
+    """θ of the neural James–Stein combiner, (H, W, 3); arguments as for its network, and ``side`` of the tiles.
+
+    The tiles' share is σ² and α; what is shrunk is the whole image, by its own relative weight.
+    """
+    planes = [image.permute(2, 0, 1).float() for image in (x, variance, y_a, y_b)]
+    size = (x.shape[0], x.shape[1])
+    q = relative_weights(planes[0][None])
+    weighted = q[0] * planes[1]
+    smoothed, alpha = torch.empty_like(planes[0]), torch.empty_like(planes[0][:1])
+    aligned = (-(-size[0] // ALIGNMENT) * ALIGNMENT, -(-size[1] // ALIGNMENT) * ALIGNMENT)
+    for region in tiles(size, -(-side // ALIGNMENT) * ALIGNMENT):
+        wide, inside = around(region, REACH, aligned)
+        with autocast(x, precision):
+            weights, share = network(*(cut(each, wide)[None] for each in planes))
+        at = (slice(None), *slices(region))
+        smoothed[at] = smoothed_variance(weights[(..., *inside)], cut(weighted, region, WINDOW // 2)[None])[0]
+        alpha[at] = share[(0, slice(None), *inside)]
+    y = alpha * planes[2] + (1 - alpha) * planes[3]
+    return shrunk(planes[0][None], y[None], smoothed[None], q)[0].permute(1, 2, 0).contiguous()
+
+
+class NeuralJamesStein(Stage):
+    """The James–Stein stage with a trained network for the variance's smoothing and the mix of two images.
+
+    The mix ``α y^A + (1 − α) y^B`` is of the halves' images so far, for the full image. What that image so far has
+    beyond their mean, such as that it was denoised whole, is added to both. A half must not lean on the image of the
+    other: there, both are its own image.
+    """
+
+    name = "neural-james-stein"
+
+    def __init__(self, settings: Settings):
+        super().__init__(settings)
+        self.network, _ = of_stage(self.name, settings, "james_stein_weights", "james-stein", VarianceNetwork)
+
+    def run(self, state: StageImages, work: Work) -> Outcome:
+        """Shrink with what the network predicts."""
+        scaled = state.scaled()
+        variance = variance_of_mean(scaled.color)
+
+        def blended(noisy: Tensor, variance: Tensor, y_a: Tensor, y_b: Tensor) -> Tensor:
+            theta = blend_whole(self.network, noisy, variance, y_a, y_b, precision=self.settings.precision)
+            return scale_(theta, 1 / state.scale)
+
+        a, b = (blended(noisy, 2 * variance, y, y) for noisy, y in zip(scaled.color, scaled.images, strict=True))
+        beyond = scaled.full - mean(scaled.images)
+        full = blended(mean(scaled.color), variance, *(image + beyond for image in scaled.images))
+        return Outcome(state.then((a, b), full))

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import safetensors
 import safetensors.torch
@@ -13,27 +13,33 @@ from torch import Tensor, nn
 from selfcorrect.errors import FileError
 from selfcorrect.publish import publish
 from selfcorrect.settings import Settings
-from selfcorrect.stages.deep_combiner import DeepCombiner
-from selfcorrect.stages.neural_james_stein import VarianceNetwork
 
-__all__ = ["PACKAGED", "check", "combiner", "load", "save", "variance_network"]
+__all__ = ["PACKAGED", "TrainedNetwork", "load", "of_stage", "save"]
 
 PACKAGED = Path(__file__).resolve().parent.parent / "weights"
 """Where the package keeps its own."""
 
 _FORMAT = "selfcorrect weights 1"
-_STAGES = {
-    "neural-james-stein": ("james_stein_weights", "james-stein"),
-    "deep-combiner": ("combiner_weights", "deep-combiner"),
-    "deep-combiner-4": ("combiner_4_weights", "deep-combiner-4"),
-}
-"""By stage: the setting that names a file, and the packaged one."""
-_NETWORKS: dict[str, type[nn.Module]] = {"james-stein": VarianceNetwork, "deep-combiner": DeepCombiner}
+
+
+class TrainedNetwork(nn.Module):
+    """A network whose weights are in a file.
+
+    Attributes:
+        kind: what files call it.
+        architecture: the arguments that rebuild it.
+    """
+
+    kind: ClassVar[str]
+    architecture: dict[str, Any]
+
+
+Kind = TypeVar("Kind", bound=TrainedNetwork)
 
 
 def save(
     path: str | Path,
-    network: VarianceNetwork | DeepCombiner,
+    network: TrainedNetwork,
     *,
     settings: Mapping[str, Any],
     data: str,
@@ -59,7 +65,7 @@ def save(
             raise FileError(f"{path}: expected finite weights in {dtype}, but got others in {name}")
     metadata = {
         "format": _FORMAT,
-        "network": next(name for name, kind in _NETWORKS.items() if isinstance(network, kind)),
+        "network": network.kind,
         "architecture": json.dumps(network.architecture),
         "settings": json.dumps(dict(settings)),
         "data": data,
@@ -68,11 +74,12 @@ def save(
     publish(Path(path), safetensors.torch.save(tensors, metadata))
 
 
-def load(path: str | Path) -> nn.Module:
-    """Read a network, in float32, for evaluation.
+def load(path: str | Path, kind: type[Kind]) -> Kind:
+    """Read a network of a kind, in float32, for evaluation.
 
     Raises:
-        FileError: the file is missing, holds no weights of selfcorrect, or they do not fit its architecture.
+        FileError: the file is missing, holds no weights of selfcorrect or those of another network, or they do not fit
+            their architecture.
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
@@ -86,15 +93,15 @@ def load(path: str | Path) -> nn.Module:
     if metadata.get("format") != _FORMAT:
         got = metadata.get("format", "another safetensors file")
         raise FileError(f"{path}: expected '{_FORMAT}', but got {got!r}; export the weights again")
-    return _built(path, metadata, tensors)
+    return _built(path, kind, metadata, tensors)
 
 
-def _built(path: str | Path, metadata: Mapping[str, str], tensors: dict[str, Tensor]) -> nn.Module:
+def _built(path: str | Path, kind: type[Kind], metadata: Mapping[str, str], tensors: dict[str, Tensor]) -> Kind:
     name, architecture = metadata.get("network", ""), metadata.get("architecture", "")
-    if name not in _NETWORKS:
-        raise FileError(f"{path}: expected a network out of {', '.join(_NETWORKS)}, but got {name!r}")
+    if name != kind.kind:
+        raise FileError(f"{path}: expected weights of {kind.kind}, but got those of {name or 'no network'}")
     try:
-        network = _NETWORKS[name](**json.loads(architecture))
+        network = kind(**json.loads(architecture))
         network.load_state_dict(tensors)
     except (TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
@@ -104,50 +111,21 @@ def _built(path: str | Path, metadata: Mapping[str, str], tensors: dict[str, Ten
     return network.eval().requires_grad_(requires_grad=False)
 
 
-def variance_network(settings: Settings) -> VarianceNetwork:
-    """The network of the stage neural-james-stein.
+def of_stage(stage: str, settings: Settings, setting: str, packaged: str, kind: type[Kind]) -> tuple[Kind, Path]:
+    """The user's own weights of a stage, else the package's; and their file.
+
+    Args:
+        stage: its name, for messages.
+        settings: of the frame.
+        setting: the one that names the user's file.
+        packaged: name of the package's file, without ending.
+        kind: of the network.
 
     Raises:
-        FileError: see :func:`load`; or the file holds another network.
+        FileError: see :func:`load`.
     """
-    path = _path(settings, "neural-james-stein")
-    network = load(path)
-    if not isinstance(network, VarianceNetwork):
-        raise FileError(f"{path}: expected weights of james-stein, but got those of a deep combiner")
-    return network
-
-
-def combiner(settings: Settings, *, pairs: int = 1) -> DeepCombiner:
-    """The network of the stage deep-combiner, of one pair of a noisy and a denoised image, or of deep-combiner-4.
-
-    Raises:
-        FileError: see :func:`load`; or the file holds another network, or one for another number of pairs.
-    """
-    stage = "deep-combiner" if pairs == 1 else f"deep-combiner-{pairs}"
-    path = _path(settings, stage)
-    network = load(path)
-    if not isinstance(network, DeepCombiner):
-        raise FileError(f"{path}: expected weights of {stage}, but got those of james-stein")
-    if network.pairs != pairs:
-        raise FileError(f"{path}: expected weights of {stage}, but got those for {network.pairs} denoised images")
-    return network
-
-
-def _path(settings: Settings, stage: str) -> Path:
-    """The user's own weights of a stage, else the package's."""
-    setting, name = _STAGES[stage]
-    path = Path(getattr(settings, setting) or PACKAGED / f"{name}.safetensors")
+    path = Path(getattr(settings, setting) or PACKAGED / f"{packaged}.safetensors")
     if not path.is_file():
         flag = setting.replace("_", "-")
         raise FileError(f"{path}: expected the weights of the stage {stage}, but got no file; name one with --{flag}")
-    return path
-
-
-def check(settings: Settings) -> None:
-    """Raise what a stage would raise that lacks its weights, before any long work."""
-    if "neural-james-stein" in settings.stage_names:
-        variance_network(settings)
-    if {"deep-combiner", "deep-combiner-4"} & set(settings.stage_names):
-        combiner(settings)
-    if "deep-combiner-4" in settings.stage_names:
-        combiner(settings, pairs=4)
+    return load(path, kind), path

@@ -64,10 +64,10 @@ def corrected(frame: Frame, preset: Settings = BALANCED) -> Result:
     )
     assert np.isfinite(list(numbers)).all()
     assert (result.estimate.change < 0) == result.estimate.improved  # what it says and what it did agree
-    for name, aov in result.aovs.items():
+    for name, aov in result.maps.items():
         assert bool(aov.isfinite().all()), name
         assert float(aov.min()) >= 0, name
-    assert float(result.aovs["blend"].max()) <= 1
+    assert float(result.maps["blend"].max()) <= 1
     return result
 
 

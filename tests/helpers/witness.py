@@ -1,18 +1,17 @@
-"""How much a half that a step made knows of the other half's noise."""
-
-from collections.abc import Callable
+"""How much a half that a stage made knows of the other half's noise."""
 
 import torch
 
 from selfcorrect.frame import Half
-from selfcorrect.stages.steps import StageImages
+from selfcorrect.stages.images import StageImages
+from selfcorrect.stages.stage import Stage, Work
 
 
-def share_of_witness(step: Callable[[StageImages], StageImages], *, heavy: bool, side: int = 128) -> float:
+def share_of_witness(stage: Stage, *, heavy: bool, side: int = 128) -> float:
     """Covariance of half a with half b's noise over its variance, and the other way round, of radiance near 1.
 
     Args:
-        step: under test.
+        stage: under test.
         heavy: log-normal noise instead of Gaussian.
         side: of the image.
     """
@@ -22,8 +21,8 @@ def share_of_witness(step: Callable[[StageImages], StageImages], *, heavy: bool,
         errors = [0.1 * torch.randn(size, generator=generator) for _ in "ab"]
         if heavy:
             errors = [0.02 * (torch.exp(15 * e) - 3.08) for e in errors]  # of mean 0
-        halves = [Half(1 + e, torch.full(size, 0.95), None, None, None, None) for e in errors]
-        images = step(StageImages((halves[0], halves[1]), torch.full(size, 0.95))).images
+        halves = [Half(1 + e, torch.full(size, 0.95)) for e in errors]
+        images = stage.run(StageImages((halves[0], halves[1]), torch.full(size, 0.95)), Work()).state.images
         for i in (0, 1):
             shares.append(float(((images[i] - 1) * errors[1 - i]).mean() / errors[1 - i].var()))
     return sum(shares) / len(shares)

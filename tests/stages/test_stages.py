@@ -1,5 +1,6 @@
 """Composition: any order, what is recorded, what a half may know, and what is refused."""
 
+import dataclasses
 import importlib
 
 import pytest
@@ -10,10 +11,11 @@ from torch import Tensor
 import denoisers
 from selfcorrect import Frame, Settings, correct
 from selfcorrect.errors import FrameError, SettingsError
-from selfcorrect.frame import mean
+from selfcorrect.frame import Candidate, mean
 from selfcorrect.guard import Guarded
-from selfcorrect.stages import steps
-from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
+from selfcorrect.settings import STAGE_NAMES
+from selfcorrect.stages import STAGES
+from selfcorrect.stages.james_stein import JamesStein, james_stein, relative_weight, variance_of_mean
 
 SMALL = {"patch": 16, "batch": 2, "steps": 2, "window": 5, "layers": 3, "regression_stride": 4}
 
@@ -68,9 +70,9 @@ def test_the_guard_compares_with_what_the_denoiser_gave(monkeypatch: pytest.Monk
     seen: list[tuple[Tensor, ...]] = []
     real = module.guard
 
-    def spy(*arguments: object, scale: float) -> Guarded:
+    def spy(*arguments: object, **options: object) -> Guarded:
         seen.append(arguments)
-        return real(*arguments, scale=scale)
+        return real(*arguments, **options)
 
     monkeypatch.setattr(module, "guard", spy)
     frame = make_frame()
@@ -98,4 +100,32 @@ def test_warm_start_without_core_is_refused() -> None:
 @pytest.mark.parametrize("heavy", [False, True])
 def test_a_james_stein_half_knows_little_of_its_witness(heavy: bool) -> None:
     """Through the smoothed variance alone."""
-    assert abs(share_of_witness(lambda state: steps.james_stein(state, settings()), heavy=heavy)) < 0.005
+    assert abs(share_of_witness(JamesStein(settings()), heavy=heavy)) < 0.005
+
+
+def test_the_settings_know_the_stages_that_there_are() -> None:
+    assert tuple(STAGES) == STAGE_NAMES
+
+
+def test_further_candidates_are_judged_with_the_stages() -> None:
+    """The truth among them is taken, noise is left, and the output is the better for it."""
+    frame = make_frame()
+    truth = Frame(color=make_frame(sigma=0.0).color)
+    noise = 3 * frame.color[0].flip(0)
+    right = Candidate("right", truth.color, mean(truth.color))
+    wrong = Candidate("wrong", (noise, noise), noise)
+    chosen = settings(stages="regression")
+    alone = correct(frame, chosen)
+    for more in ((right,), (wrong, right), (right, wrong)):
+        helped = correct(dataclasses.replace(frame, more=more), chosen)
+        error, error_alone = (float(((r.image - right.full) ** 2).mean()) for r in (helped, alone))
+        assert error < 0.3 * error_alone
+        assert helped.maps["blend"].max() <= 1 + 1e-6
+    left = correct(dataclasses.replace(frame, more=(wrong,)), chosen)
+    assert float(((left.image - right.full) ** 2).mean()) <= 1.02 * error_alone
+
+
+def test_a_candidate_of_another_size_is_refused() -> None:
+    image = torch.zeros(3, 4, 3)
+    with pytest.raises(FrameError, match=r"candidate odd of shape \(40, 44, 3\), but got \(3, 4, 3\)"):
+        dataclasses.replace(make_frame(), more=(Candidate("odd", (image, image), image),))

@@ -1,6 +1,7 @@
 """The trained stages: tiles, what a half is made of, what they agree with, what they refuse, and the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,13 @@ from selfcorrect.errors import FileError, FrameError, SettingsError
 from selfcorrect.files import Sources
 from selfcorrect.frame import mean
 from selfcorrect.shot import run as shot
-from selfcorrect.stages import steps, tiled, weights
-from selfcorrect.stages.deep_combiner import DeepCombiner, feature_planes
+from selfcorrect.stages import STAGES, opened, weights
+from selfcorrect.stages.deep_combiner import DeepCombiner, combine_whole, feature_planes
+from selfcorrect.stages.deep_combiner_4 import SubImages
+from selfcorrect.stages.images import StageImages
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
-from selfcorrect.stages.neural_james_stein import VarianceNetwork, neural_blend
-from selfcorrect.stages.steps import StageImages, SubImage
+from selfcorrect.stages.neural_james_stein import NeuralJamesStein, VarianceNetwork, blend_whole, neural_blend
+from selfcorrect.stages.stage import Work
 
 SMALL = {"width": 8, "window": 5, "layers": 3, "kernel": 3}
 SIZE = (44, 39)
@@ -58,7 +61,12 @@ def settings(files: dict[str, str], **changes: object) -> Settings:
 
 
 def make_frame(size: tuple[int, int] = SIZE, *, features: bool = True, scale: float = 1.0) -> Frame:
-    """A frame of four sub-images, denoised by a box."""
+    """The frame of :func:`make_both`."""
+    return make_both(size, features=features, scale=scale)[0]
+
+
+def make_both(size: tuple[int, int] = SIZE, *, features: bool = True, scale: float = 1.0) -> tuple[Frame, SubImages]:
+    """A frame and its four sub-images, denoised by a box."""
     generator = torch.Generator().manual_seed(0)
     y, x = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
     albedo = (0.5 + 0.3 * torch.sin(x / 2))[..., None].expand(*size, 3).contiguous()
@@ -70,7 +78,9 @@ def make_frame(size: tuple[int, int] = SIZE, *, features: bool = True, scale: fl
         depth = 3 + torch.rand(*size, 1, generator=generator)
         buffers = {"albedo": (albedo, albedo), "normal": (normal, -normal), "depth": (depth, depth + 1)}
     color = (mean((four[0], four[1])), mean((four[2], four[3])))
-    return Frame(color=color, sub_images=four, **buffers).denoise(denoisers.create("box"))
+    box = denoisers.create("box")
+    frame = Frame(color=color, **buffers).denoise(box)
+    return frame, SubImages.of(frame, four).denoise(frame, box)
 
 
 def planes(image: Tensor) -> Tensor:
@@ -78,8 +88,7 @@ def planes(image: Tensor) -> Tensor:
 
 
 def state_of(frame: Frame, scale: float = 1.0) -> StageImages:
-    subs = zip(frame.sub_images, frame.denoised_sub_images, strict=True)
-    return StageImages(frame.halves, frame.denoised_full, scale, tuple(SubImage(*each) for each in subs))
+    return StageImages(frame.halves, frame.denoised_full, scale)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 70), (64, 64), (101, 83)])
@@ -93,9 +102,9 @@ def test_tiles_are_equal_to_the_whole(size: tuple[int, int], precision: str, tol
 
     def both(side: int) -> tuple[Tensor, Tensor]:
         options: dict[str, Any] = {"precision": precision, "side": side}
-        one = tiled.combine(combiner, (a,), (frame.denoised[0],), features, **options)
+        one = combine_whole(combiner, (a,), (frame.denoised[0],), features, **options)
         y = frame.denoised
-        return one, tiled.neural_james_stein(variance_network, mean((a, b)), ((a - b) / 2) ** 2, *y, **options)
+        return one, blend_whole(variance_network, mean((a, b)), ((a - b) / 2) ** 2, *y, **options)
 
     for whole, pieces, different in zip(both(4096), both(32), (a, mean((a, b))), strict=True):
         found = (pieces - whole).abs()
@@ -105,7 +114,7 @@ def test_tiles_are_equal_to_the_whole(size: tuple[int, int], precision: str, tol
 
 
 def test_tiles_of_single_precision_are_those_of_the_network() -> None:
-    frame = make_frame()
+    frame, subs = make_both()
     network, four = wild(VarianceNetwork()), wild(DeepCombiner(4, **SMALL))
     x, variance = mean(frame.color), variance_of_mean(frame.color).float()
     given = [planes(image) for image in (x, variance, *frame.denoised)]
@@ -113,13 +122,12 @@ def test_tiles_of_single_precision_are_those_of_the_network() -> None:
         expected = neural_blend(*network(*given), *given)
         features = torch.rand(7, *SIZE, generator=torch.Generator().manual_seed(2))
         noisy, denoised = (
-            torch.stack([image.permute(2, 0, 1) for image in images])[None]
-            for images in (frame.sub_images, frame.denoised_sub_images)
+            torch.stack([image.permute(2, 0, 1) for image in images])[None] for images in (subs.images, subs.denoised)
         )
         combined = four(noisy, denoised, features[None])
-    got = tiled.neural_james_stein(network, x, variance, *frame.denoised, side=16)
+    got = blend_whole(network, x, variance, *frame.denoised, side=16)
     torch.testing.assert_close(planes(got), expected, rtol=1e-5, atol=1e-5)
-    got = tiled.combine(four, frame.sub_images, frame.denoised_sub_images, features, side=16)
+    got = combine_whole(four, subs.images, subs.denoised, features, side=16)
     torch.testing.assert_close(planes(got), combined, rtol=1e-5, atol=1e-5)
 
 
@@ -129,9 +137,10 @@ def test_tiles_of_single_precision_are_those_of_the_network() -> None:
 @pytest.mark.parametrize("features", [True, False])
 def test_exposure_changes_nothing(stages: str, features: bool, files: dict[str, str]) -> None:
     chosen = settings(files, stages=stages)
-    frame, bright = (make_frame(features=features, scale=scale) for scale in (1.0, 1000.0))
-    plain = correct(frame, chosen).image
-    torch.testing.assert_close(correct(bright, chosen).image / 1000, plain, rtol=1e-4, atol=1e-5)
+    (frame, subs), (bright, bright_subs) = (make_both(features=features, scale=scale) for scale in (1.0, 1000.0))
+    plain = correct(frame, chosen, extra={"deep-combiner-4": subs}).image
+    brighter = correct(bright, chosen, extra={"deep-combiner-4": bright_subs}).image
+    torch.testing.assert_close(brighter / 1000, plain, rtol=1e-4, atol=1e-5)
     assert not torch.allclose(plain, frame.denoised_full, atol=1e-3)
 
 
@@ -144,10 +153,10 @@ def test_composition_with_the_core_and_the_guard(files: dict[str, str]) -> None:
     assert result.estimate is not None
 
 
-@pytest.mark.parametrize("name", ["deep_combiner", "deep_combiner_4"])
+@pytest.mark.parametrize("name", ["deep-combiner", "deep-combiner-4"])
 def test_a_combined_half_knows_nothing_of_its_witness(name: str, files: dict[str, str]) -> None:
     """Not a bit of half a changes with anything of half b; the full image does."""
-    frame = make_frame()
+    frame, subs = make_both()
     other = Frame(
         color=(frame.color[0], 2 * frame.color[1]),
         denoised=(frame.denoised[0], 3 * frame.denoised[1]),
@@ -155,11 +164,17 @@ def test_a_combined_half_knows_nothing_of_its_witness(name: str, files: dict[str
         normal=(frame.normal[0], frame.normal[0]),
         depth=(frame.depth[0], frame.depth[1] ** 2),
         denoised_full=2 * frame.denoised_full,
-        sub_images=(*frame.sub_images[:2], *(2 * image for image in frame.sub_images[2:])),
-        denoised_sub_images=(*frame.denoised_sub_images[:2], *frame.denoised_sub_images[:2]),
     )
-    step, chosen = getattr(steps, name), settings(files)
-    one, changed = (step(state_of(each, scale=1.5), chosen) for each in (frame, other))
+    others = replace(
+        subs,
+        images=(*subs.images[:2], *(2 * image for image in subs.images[2:])),
+        denoised=(*subs.denoised[:2], *subs.denoised[:2]),
+    )
+    stage = STAGES[name](settings(files, stages=name))
+    one, changed = (
+        stage.run(state_of(each, scale=1.5), Work(extra=extra)).state
+        for each, extra in ((frame, subs), (other, others))
+    )
     assert torch.equal(one.images[0], changed.images[0])
     assert not torch.equal(one.images[1], changed.images[1])
     assert not torch.equal(one.full, changed.full)
@@ -168,18 +183,15 @@ def test_a_combined_half_knows_nothing_of_its_witness(name: str, files: dict[str
 @pytest.mark.parametrize("heavy", [False, True])
 def test_a_james_stein_half_knows_little_of_its_witness(heavy: bool, files: dict[str, str]) -> None:
     """As for the classical variant: of half b it sees the variance alone, never the image."""
-    assert (
-        abs(share_of_witness(lambda state: steps.neural_james_stein(state, settings(files)), heavy=heavy, side=96))
-        < 0.005
-    )
+    assert abs(share_of_witness(NeuralJamesStein(settings(files)), heavy=heavy, side=96)) < 0.005
 
 
 def test_neural_james_stein_by_hand(files: dict[str, str]) -> None:
     """The full image mixes the halves' images, moved by what the full one has beyond their mean."""
     frame = make_frame()
     state = state_of(frame)._replace(full=frame.denoised_full + 0.1)
-    got = steps.neural_james_stein(state, settings(files))
-    network = weights.variance_network(settings(files))
+    stage = NeuralJamesStein(settings(files))
+    got, network = stage.run(state, Work()).state, stage.network
     beyond = frame.denoised_full + 0.1 - mean(frame.denoised)
     x, variance = mean(frame.color), variance_of_mean(frame.color).float()
     given = [planes(image) for image in (x, variance, *(image + beyond for image in frame.denoised))]
@@ -197,7 +209,8 @@ def test_flat_weights_are_the_classical_stage(tmp_path: Path) -> None:
     frame = make_frame()
     a, b = frame.color[0], frame.color[0] + 0.3
     state = StageImages((frame.halves[0], frame.halves[1]._replace(color=b)), mean(frame.denoised))
-    got = steps.neural_james_stein(state, settings({}, james_stein_weights=str(tmp_path / "flat.safetensors"))).full
+    stage = NeuralJamesStein(settings({}, james_stein_weights=str(tmp_path / "flat.safetensors")))
+    got = stage.run(state, Work()).state.full
     x, variance = mean((a, b)), variance_of_mean((a, b))
     q = relative_weight(x)
     smoothed = torch.nn.functional.avg_pool2d(
@@ -224,62 +237,63 @@ def test_extremes_stay_finite(stages: str, extreme: float, files: dict[str, str]
     for size in ((1, 1), (9, 30)):
         four = [torch.rand(*size, 3) if extreme else torch.zeros(*size, 3) for _ in range(4)]
         four[0][0, 0] = extreme
-        frame = Frame(color=(mean(four[:2]), mean(four[2:])), sub_images=four).denoise(denoisers.create("box"))
+        box = denoisers.create("box")
+        frame = Frame(color=(mean(four[:2]), mean(four[2:]))).denoise(box)
+        extra = {"deep-combiner-4": SubImages.of(frame, four).denoise(frame, box)}
         for precision in ("fp32", "bf16"):
-            image = correct(frame, settings(files, stages=stages, precision=precision)).image
+            image = correct(frame, settings(files, stages=stages, precision=precision), extra=extra).image
             assert image.isfinite().all()
             assert image.min() >= 0
 
 
 def test_sub_images_are_checked() -> None:
-    frame = make_frame()
-    color, four = frame.color, frame.sub_images
+    frame, subs = make_both()
+    four = subs.images
     rounded = [image.half().float() for image in four]
-    Frame(color=tuple(half.half().float() for half in color), sub_images=rounded)
+    SubImages.of(Frame(color=tuple(half.half().float() for half in frame.color)), rounded)
     with pytest.raises(FrameError, match="four arrays"):
-        Frame(color=color, sub_images=four[:3])
+        SubImages.of(frame, four[:3])
     with pytest.raises(FrameError, match="mean is half a"):
-        Frame(color=color, sub_images=(*four[2:], *four[:2]))
+        SubImages.of(frame, (*four[2:], *four[:2]))
     with pytest.raises(FrameError, match="mean is half b"):
-        Frame(color=color, sub_images=(*four[:2], four[2], four[2]))
+        SubImages.of(frame, (*four[:2], four[2], four[2]))
     with pytest.raises(FrameError, match="sub_images of half b, second of 39x44"):
-        Frame(color=color, sub_images=(*four[:3], four[3][:-1]))
+        SubImages.of(frame, (*four[:3], four[3][:-1]))
 
 
 def test_sub_images_are_repaired() -> None:
-    frame = make_frame()
-    broken = [image.clone() for image in frame.sub_images]
+    frame, subs = make_both()
+    broken = [image.clone() for image in subs.images]
     broken[0][3, 4], broken[3][0, 0, 1] = float("nan"), float("inf")
     broken[1][8, 8] = -1
-    repaired = Frame(color=frame.color, sub_images=broken)
+    repaired = SubImages.of(frame, broken)
     assert repaired.repairs["sub_images"] == (2, 1)
-    assert all(image.isfinite().all() and image.min() >= 0 for image in repaired.sub_images)
-    assert torch.equal(repaired.sub_images[2], frame.sub_images[2])
+    assert all(image.isfinite().all() and image.min() >= 0 for image in repaired.images)
+    assert torch.equal(repaired.images[2], subs.images[2])
 
 
 def test_sub_images_are_denoised_each_on_its_own() -> None:
     """Also by a denoiser that takes two at once: those of half a are never shown with those of half b."""
-    frame = make_frame()
+    frame, subs = make_both()
     box, nlm = denoisers.create("box"), denoisers.create("nlm")
-    for image, denoised in zip(frame.sub_images, frame.denoised_sub_images, strict=True):
+    for image, denoised in zip(subs.images, subs.denoised, strict=True):
         torch.testing.assert_close(denoised, box(image))
-    dual = frame.denoise(nlm).denoised_sub_images
+    dual = subs.denoise(frame, nlm).denoised
     features = {name: getattr(frame, name) for name in ("albedo", "normal", "depth")}
-    own = nlm.pair(frame.sub_images[2:], visibility=None, **{name: (p[1], p[1]) for name, p in features.items()})
+    own = nlm.pair(subs.images[2:], visibility=None, **{name: (p[1], p[1]) for name, p in features.items()})
     assert torch.equal(dual[2], own[0])
     assert torch.equal(dual[3], own[1])
 
 
 def test_what_cannot_be_run_is_refused(files: dict[str, str]) -> None:
-    frame = make_frame()
-    plain = Frame(color=frame.color, denoised=frame.denoised)
+    frame, subs = make_both()
+    plain, four = Frame(color=frame.color, denoised=frame.denoised), settings(files, stages="deep-combiner-4")
     with pytest.raises(FrameError, match="sub-images for the stage deep-combiner-4, but got none"):
-        correct(plain, settings(files, stages="deep-combiner-4"))
-    undenoised = Frame(color=frame.color, denoised=frame.denoised, sub_images=frame.sub_images)
+        correct(plain, four)
     with pytest.raises(FrameError, match="not denoised"):
-        correct(undenoised, settings(files, stages="deep-combiner-4"))
+        correct(plain, four, extra={"deep-combiner-4": SubImages.of(plain, subs.images)})
     with pytest.raises(SettingsError, match="as the first stage"):
-        settings(files, stages="core,deep-combiner-4")
+        opened(settings(files, stages="core,deep-combiner-4"))
     with pytest.raises(FileError, match="--combiner-weights"):
         correct(frame, settings(files, stages="deep-combiner", combiner_weights="missing.safetensors"))
 
@@ -299,7 +313,7 @@ def renders(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """A corner of the packaged frame as half-float files: halves a and b, then the sub-images of each."""
     folder = tmp_path_factory.mktemp("renders")
     generator, halves, subs = np.random.default_rng(0), [], []
-    data = Path(exr.__file__).parent / "data"
+    data = Path(exr.__file__).parents[1] / "data"
     for which in "ab":
         buffers = exr.load_half(str(data / f"demo_064spp_{which.upper()}.exr")).buffers
         color, *others = (buffers[name][100:164, 90:160] for name in ("color", "albedo", "normal", "depth"))
@@ -335,8 +349,11 @@ def test_the_command(
         report = json.loads(capsys.readouterr().out)
         loaded = [exr.load_half(path).buffers for path in renders]
         pairs = {name: tuple(half[name] for half in loaded[:2]) for name in ("color", "albedo", "normal", "depth")}
-        frame = Frame(**pairs, sub_images=tuple(half["color"] for half in loaded[2:]))
-        expected = correct(frame.denoise(denoisers.create("oidn", threads=1)), settings(files, stages=stages)).image
+        oidn = denoisers.create("oidn", threads=1)
+        frame = Frame(**pairs).denoise(oidn)
+        subs = SubImages.of(frame, [half["color"] for half in loaded[2:]]).denoise(frame, oidn)
+        extra = {"deep-combiner-4": subs}
+        expected = correct(frame, settings(files, stages=stages), extra=extra).image
     finally:
         torch.set_num_threads(threads)
     assert report["settings"]["combiner_4_weights"] == files["combiner_4_weights"]
@@ -390,8 +407,8 @@ def test_other_weights_are_another_recipe(renders: list[str], files: dict[str, s
 
 
 def test_sub_images_count_as_memory(renders: list[str]) -> None:
-    four = Sources(*renders[:2], sub_images=tuple(renders[2:]))
-    with_them, without = (memory.needs(each, Settings()) for each in (four, Sources(*renders[:2])))
+    sources = Sources(*renders[:2])
+    with_them, without = (memory.needs(sources, Settings(), extra=count) for count in (4, 0))
     image = 64 * 70 * 12  # bytes
     grown = [one - other for one, other in zip(with_them, without, strict=True)]
     assert grown == [4 * image, 8 * image, 8 * image, 0]

@@ -11,7 +11,7 @@ import torch
 
 from selfcorrect import Settings
 from selfcorrect.errors import FileError
-from selfcorrect.stages import weights
+from selfcorrect.stages import opened, weights
 from selfcorrect.stages.deep_combiner import DeepCombiner
 from selfcorrect.stages.neural_james_stein import VarianceNetwork
 
@@ -28,7 +28,7 @@ def saved(path: Path, network: VarianceNetwork | DeepCombiner, **options: Any) -
 @pytest.mark.parametrize("network", [VarianceNetwork(1), DeepCombiner(**SMALL), DeepCombiner(4, **SMALL)])
 def test_what_was_saved_comes_back(network: VarianceNetwork | DeepCombiner, dtype: torch.dtype, tmp_path: Path) -> None:
     path = saved(tmp_path / "w.safetensors", network, dtype=dtype)
-    loaded = weights.load(path)
+    loaded = weights.load(path, type(network))
     assert type(loaded) is type(network)
     assert loaded.architecture == network.architecture
     assert not loaded.training
@@ -55,7 +55,7 @@ def test_weights_that_half_floats_cannot_hold_are_not_saved(tmp_path: Path) -> N
     with pytest.raises(FileError, match=r"convolutions\.1\.weight"):
         saved(tmp_path / "w.safetensors", network)
     assert not list(tmp_path.iterdir())
-    assert weights.load(saved(tmp_path / "w.safetensors", network, dtype=torch.bfloat16)) is not None
+    assert weights.load(saved(tmp_path / "w.safetensors", network, dtype=torch.bfloat16), DeepCombiner) is not None
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
         (tmp_path, "expected"),
     ):
         with pytest.raises(FileError, match=line) as error:
-            weights.load(path)
+            weights.load(path, DeepCombiner)
         assert str(path) in str(error.value)
         assert "\n" not in str(error.value)
 
@@ -93,7 +93,7 @@ def test_weights_that_do_not_fit_are_refused_in_one_line(change: dict[str, str],
         metadata = file.metadata()
     path.write_bytes(safetensors.torch.save(safetensors.torch.load_file(path), metadata | change))
     with pytest.raises(FileError, match="expected") as error:
-        weights.load(path)
+        weights.load(path, DeepCombiner)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -108,10 +108,10 @@ def test_a_stage_gets_its_own_network_only(tmp_path: Path) -> None:
         combiner_weights=one,
         combiner_4_weights=four,
     )
-    weights.check(fits)
+    opened(fits)
     assert fits.files == (variance, one, four)
     for changes, line in (
-        ({"james_stein_weights": one}, "those of a deep combiner"),
+        ({"james_stein_weights": one}, "those of deep-combiner"),
         ({"combiner_weights": variance}, "those of james-stein"),
         ({"combiner_weights": four}, "those for 4 denoised images"),
         ({"combiner_4_weights": one}, "those for 1 denoised images"),
@@ -119,15 +119,16 @@ def test_a_stage_gets_its_own_network_only(tmp_path: Path) -> None:
         ({"james_stein_weights": str(tmp_path / "none")}, "--james-stein-weights"),
     ):
         with pytest.raises(FileError, match=line):
-            weights.check(Settings.from_dict(fits.to_dict() | changes))
-    weights.check(Settings(combiner_weights=str(tmp_path / "none")))  # no stage asks for it
+            opened(Settings.from_dict(fits.to_dict() | changes))
+    opened(Settings(combiner_weights=str(tmp_path / "none")))  # no stage asks for it
 
 
 def test_the_package_is_where_weights_are_looked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert Path(weights.__file__).parent.parent / "weights" == weights.PACKAGED
     monkeypatch.setattr(weights, "PACKAGED", tmp_path)
     with pytest.raises(FileError, match=r"james-stein\.safetensors: .* --james-stein-weights"):
-        weights.check(Settings(stages="neural-james-stein"))
+        opened(Settings(stages="neural-james-stein"))
     saved(tmp_path / "james-stein.safetensors", VarianceNetwork(5))
-    got = weights.variance_network(Settings(stages="neural-james-stein")).last.weight
+    (stage,) = opened(Settings(stages="neural-james-stein"))
+    got = stage.network.last.weight
     assert torch.equal(got, VarianceNetwork(5).last.weight.half().float())

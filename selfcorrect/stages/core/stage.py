@@ -6,14 +6,13 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from selfcorrect.frame import Half, mean
 from selfcorrect.image.bands import bands
-from selfcorrect.image.exposure import Scaled, scaled
+from selfcorrect.image.exposure import Scaled, scale_
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.infer import SIDE, infer, infer_tile
@@ -21,36 +20,13 @@ from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.patches import crops, overhang
 from selfcorrect.stages.core.train import Limits, Progress, starting_losses, train
 from selfcorrect.stages.core.trust import trust_in_full
-from selfcorrect.stages.steps import StageImages
+from selfcorrect.stages.images import StageImages
+from selfcorrect.stages.stage import Keep, Learned, Outcome, Stage, Start, Work
 
-__all__ = ["Start", "Trained", "inferred", "trained"]
-
-Keep = Callable[[slice, tuple[Tensor, Tensor]], None]
+__all__ = ["Core", "inferred", "trained"]
 
 _TRIAL = 256  # side of the tile whose time is taken for the time budget
 _GUARD_SECONDS = 2e-6  # a pixel, with some to spare
-
-
-class Start(NamedTuple):
-    """What training began from.
-
-    Attributes:
-        warm: from the network that was given, not from a new one.
-        cold_loss: Eq. 8 of a new network on a sample of the frame; None where no network was given.
-        warm_loss: the same of the network that was given.
-    """
-
-    warm: bool
-    cold_loss: float | None = None
-    warm_loss: float | None = None
-
-
-class Trained(NamedTuple):
-    """A network optimised on a frame, how it began, and Eq. 8 before each step."""
-
-    network: Network
-    start: Start
-    losses: list[float]
 
 
 def trained(
@@ -60,7 +36,7 @@ def trained(
     warm_start: Network | None = None,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
-) -> Trained:
+) -> Learned:
     """A network optimised on the state's halves; arguments as in :func:`selfcorrect.correct`."""
     began = time.perf_counter()
     generator = torch.Generator().manual_seed(settings.seed)
@@ -77,7 +53,7 @@ def trained(
         reserved = _seconds_after_training(network, state, settings)
         limits = replace(limits, seconds=settings.time_budget - reserved - (time.perf_counter() - began))
     losses = train(network, guides, _warm(settings) if start.warm else settings, generator, progress, limits)
-    return Trained(network, start, losses)
+    return Learned(network, start, losses)
 
 
 def inferred(state: StageImages, network: Network, settings: Settings, keep: Keep) -> Tensor:
@@ -101,7 +77,7 @@ def inferred(state: StageImages, network: Network, settings: Settings, keep: Kee
             trust = trust_in_full(images, full, rows).to(image.dtype)
             image[rows] += trust * (mean(corrected(rows, state.full)) - image[rows])
         keep(rows, halves)
-    return scaled(image.clamp_(min=0), 1 / state.scale)
+    return scale_(image.clamp_(min=0), 1 / state.scale)
 
 
 def _training_guides(state: StageImages, settings: Settings, generator: torch.Generator) -> tuple[Guides, Guides]:
@@ -163,3 +139,30 @@ def _start(cold: Network, warm: Network, guides: tuple[Guides, Guides], settings
     gain = cold_losses - warm_losses
     chance = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
     return Start(float(gain.mean()) > chance, float(cold_losses.mean()), float(warm_losses.mean()))
+
+
+class Core(Stage):
+    """A network trained on the frame's own halves, and what it makes of them."""
+
+    name = "core"
+    learns = True
+
+    def run(self, state: StageImages, work: Work) -> Outcome:
+        """Train, then infer."""
+        began = time.perf_counter()
+        learned = trained(state, self.settings, warm_start=work.warm_start, progress=work.progress, stop=work.stop)
+        middle = time.perf_counter()
+        after = self._after(state, learned.network, work.keep)
+        return Outcome(after, learned, {"train": middle - began, "infer": time.perf_counter() - middle})
+
+    def _after(self, state: StageImages, network: Network, keep: Keep | None) -> StageImages:
+        if keep is not None:
+            return state._replace(full=inferred(state, network, self.settings, keep))
+        images = torch.empty_like(state.full), torch.empty_like(state.full)
+
+        def hold(rows: slice, halves: tuple[Tensor, Tensor]) -> None:
+            for image, half in zip(images, halves, strict=True):
+                image[rows] = half / state.scale
+
+        full = inferred(state, network, self.settings, hold)
+        return state.then(images, full)
