@@ -20,7 +20,7 @@ _SCRATCH = 3 * 2**29  # bytes
 class Oidn:
     """OIDN's ``RT`` filter on the CPU, HDR on, at its default (high) quality.
 
-    OIDN learnt no model for a normal without an albedo: such a frame is denoised from its colour alone.
+    OIDN has no model for a normal without an albedo: such a frame is denoised from its colour alone.
     The same input gives the same bits whatever was denoised before; another number of threads moves the
     result by some 1e-6 of its value.
     """
@@ -35,7 +35,7 @@ class Oidn:
     def __init__(self, threads: int | None = None, scratch: int | None = None):
         """``scratch`` bounds the filter's own memory, bytes: it goes through the image in tiles, with the same bits.
 
-        Less than some 0.34 GiB is not to be had. Left to itself it takes 1.1 GiB of 1920×1080, 2.9 GiB of 7680×4320.
+        It takes some 0.34 GiB at least. Left to itself it takes 1.1 GiB of 1920×1080, 2.9 GiB of 7680×4320.
         """
         self.scratch = scratch or _SCRATCH
         self.device = Device(DeviceType.CPU)

@@ -188,7 +188,7 @@ def test_tensors_in_tensors_out() -> None:
     np.testing.assert_array_equal(image.numpy(), correct(frame, SMALL).image)
 
 
-def test_the_road_of_other_devices_gives_the_same_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_path_of_other_devices_gives_the_same_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a device without the compiled kernel runs: the reference as a shift loop gives the same frame."""
     from selfcorrect.kernel import cross_bilateral as kernel
 

@@ -40,7 +40,7 @@ def peak(isa: str) -> float:
 
 
 def multiply_adds(network: Network, *, backward: bool) -> int:
-    """Per pixel; the way back takes as many for the weights, and for the inputs except the first layer's."""
+    """Per pixel; the backward pass takes as many for the weights, and for the inputs except the first layer's."""
     layers = [parameter.numel() for parameter in network.parameters() if parameter.ndim == 4]
     return 3 * sum(layers) - layers[0] if backward else sum(layers)
 

@@ -53,7 +53,7 @@ _FUNCTIONS = {name: getattr(math, name) for name in ("sin", "cos", "tan", "sqrt"
 
 
 class RenderError(Exception):
-    """A scene or a flag that the user can mend; one line."""
+    """A scene or a flag that the user can fix; one line."""
 
 
 def evaluate(expression: str, frame: int) -> float:

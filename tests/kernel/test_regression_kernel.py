@@ -82,7 +82,7 @@ def test_windows(window: int, isa: str) -> None:
 
 @pytest.mark.parametrize("isa", VARIANTS)
 def test_rank_deficient_windows(isa: str) -> None:
-    """Constant features, a feature given twice, a black region: no slope where nothing tells one."""
+    """Constant features, a feature given twice, a black region: no slope where nothing determines one."""
     features, targets = make((12, 20), 2, 2)
     features[1] = features[0].clone()
     features[2][:] = 0.3

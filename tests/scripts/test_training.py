@@ -164,7 +164,7 @@ class TestDenoiser:
 
 
 class TestTraining:
-    def test_a_killed_run_goes_on_with_the_losses_of_an_unbroken_one(self, data: Path, tmp_path: Path) -> None:
+    def test_a_killed_run_continues_with_the_losses_of_an_unbroken_one(self, data: Path, tmp_path: Path) -> None:
         steps = ("--steps", 14)
         ran(*training("denoiser", data, tmp_path / "unbroken", *steps))
         broken = training("denoiser", data, tmp_path / "broken", *steps, "--checkpoint-seconds", 0)
@@ -184,7 +184,7 @@ class TestTraining:
         for name in ("network", "mean"):
             assert all(torch.equal(a, b) for a, b in zip(*(state[name].values() for state in states), strict=True))
 
-    def test_another_run_is_not_gone_on_with(self, data: Path, runs: Path) -> None:
+    def test_another_run_is_not_continued(self, data: Path, runs: Path) -> None:
         with pytest.raises(SystemExit, match="use another --out"):
             ran(*training("denoiser", data, runs / "denoiser", "--steps", 5))
 

@@ -111,7 +111,7 @@ class TestSkipExisting:
         _, _, frames = sequence(arguments(shot_folder, "--skip-existing"))
         assert frames[2]["start"]["warm_loss"] is None
 
-    def test_a_state_of_another_making_is_not_gone_on_from(self, shot_folder: Path, sequence: Run) -> None:
+    def test_a_state_made_otherwise_is_not_continued(self, shot_folder: Path, sequence: Run) -> None:
         state = ["--save-state", shot_folder / "state.safetensors"]
         sequence(arguments(shot_folder, *state, last=2))
         write_half(shot_folder / "b.0002.exr", 777)

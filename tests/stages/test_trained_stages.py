@@ -414,7 +414,7 @@ def test_sub_images_count_as_memory(renders: list[str]) -> None:
     assert grown == [4 * image, 8 * image, 8 * image, 0]
 
 
-def test_help_tells_of_the_weights(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_the_weights(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         cli.main(["frame", "--help"])
     assert ended.value.code == 0
