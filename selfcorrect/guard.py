@@ -27,13 +27,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
+from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, shares, tile_means, widened
 from selfcorrect.image.exposure import Radiance
 
 __all__ = ["Estimate", "Evidence", "Guarded", "guard", "keep_light_"]
 
 _LEVELS = (128, 64, 32, 16)  # sides of the tiles
-_PRIOR_VARIANCE = 0.25  # how far a tile's α may be expected to lie from that of the tile around it, squared
+_LARGEST_SPREAD = 0.25  # of a tile's α about that of the tile around it, squared
+_LEAST_SPREAD = 0.01
+_ROUNDS = 8  # of the frame's robust fit
+_OUTLYING = 3.0  # usual rests
+_MEDIAN_OF_NORMAL = 0.6745  # of the size of a normal variable, in standard deviations
+_OUTERMOST = 0.005  # share of the tiles at either end that the verdict pulls in
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
 _SWEEPS = 16  # over several candidates
@@ -210,7 +215,7 @@ def guard(
 
     gain = tile_means(size[0], gains)
     # More than chance, in the weights that decide and in those of the metric.
-    improved = all(mean > _standard_error(tiles) for mean, tiles in zip(average(gain, size), gain, strict=True))
+    improved = all(_more_than_chance(tiles) for tiles in gain)
 
     alpha = _pooled(size, evidence.both, count) if improved else gain.new_zeros(count, 1, 1)
     for rows in bands(size[0]):
@@ -292,21 +297,63 @@ def _estimate(squares: Tensor, size: tuple[int, int], improved: bool) -> tuple[E
 
 def _pooled(size: tuple[int, int], nd: Callable[[slice], Tensor], count: int) -> Tensor:
     """α over the smallest tiles, (K, h, w), from evidence pooled over the frame, then over ever smaller tiles."""
-    tiles = tile_means(size[0], nd)
-    means = tiles.new_tensor(average(tiles, size)).reshape(-1, 1, 1)
-    chance = tiles.new_tensor([_standard_error(n) for n in tiles[:count]]).reshape(-1, 1, 1)
-    nothing = torch.zeros_like(chance)
-    alpha = _solved(means[:count], means[count:], nothing, nothing, chance)
+    alpha = _of_frame(tile_means(size[0], nd), size, count)
     for side in _LEVELS:
         if side > max(size):
             continue
         moments = tile_means(size[0], partial(_moments, size, nd, alpha), side)
-        n, d, around, scatter = moments.split([count, len(means) - count, count, count])
+        n, d, around, scatter = moments.split([count, count * (count + 1) // 2, count, count])
         variance = scatter / side**2
         curvature = torch.stack([d[_place(k, k, count)] for k in range(count)])
-        ridge = variance / (_PRIOR_VARIANCE * curvature).clamp(min=_FLOOR)
+        spread = _spread(_left(n, d, around), curvature, variance)
+        ridge = (variance / (spread * curvature).clamp(min=_FLOOR)).clamp(max=1 / _FLOOR)
         alpha = _solved(n, d, around, ridge, variance.sqrt())
     return alpha
+
+
+def _of_frame(tiles: Tensor, size: tuple[int, int], count: int) -> Tensor:
+    """One α of each candidate for the whole frame, (K, 1, 1), by a least-squares fit that outlying tiles cannot lead.
+
+    A firefly in the witness makes n of its tile larger than that of all others together. So tiles are weighed down by
+    what the fit leaves of their n, 1 / (1 + (rest / 3s)²) with s the usual rest (Cauchy weights, fitted in rounds).
+    """
+    n, d = tiles[:count].flatten(1), tiles[count:].flatten(1)
+    weight = shares(tiles, size).flatten()
+    trust = torch.ones_like(weight)
+    nothing = tiles.new_zeros(count, 1, 1)
+    alpha = nothing
+    for _ in range(_ROUNDS):
+        share = weight * trust / (weight * trust).sum()
+        means = [(planes * share).sum(1).reshape(-1, 1, 1) for planes in (n, d)]
+        variance = ((n - means[0].flatten(1)) ** 2 * share).sum(1) * (share**2).sum()
+        chance = variance.sqrt() if n.shape[1] > 1 else n[:, 0].abs()
+        alpha = _solved(means[0], means[1], nothing, nothing, chance.reshape(-1, 1, 1))
+        rest = _left(n, d, alpha.flatten(1))
+        usual = rest.abs().median(1, keepdim=True).values.clamp(min=_FLOOR) / _MEDIAN_OF_NORMAL
+        trust = 1 / (1 + ((rest / (_OUTLYING * usual)) ** 2).amax(0))
+    return alpha
+
+
+def _spread(left: Tensor, curvature: Tensor, variance: Tensor) -> Tensor:
+    """How far α of a tile lies from that of the tile around it, squared, as a mean over all tiles, (K, 1, 1).
+
+    What the tiles' own estimates differ by, less what chance explains; tiles count by how certain they are. Where it is
+    small, as with an image that is as good everywhere, tiles keep to what the frame says.
+    """
+    certain = (variance + _LARGEST_SPREAD * curvature**2).clamp(min=_FLOOR)
+    found = ((left**2 - variance) / certain).clamp(max=1 / _LARGEST_SPREAD).sum((1, 2), keepdim=True)
+    weights = (curvature**2 / certain).sum((1, 2), keepdim=True).clamp(min=_FLOOR)
+    return (found / weights).clamp(_LEAST_SPREAD, _LARGEST_SPREAD)
+
+
+def _left(n: Tensor, d: Tensor, alpha: Tensor) -> Tensor:
+    """n_k − Σ_m α_m d_km: what the weights α leave of n, in the shape of n."""
+    count = len(n)
+    rest = list(n)
+    for k in range(count):
+        for m in range(count):
+            rest[k] = rest[k] - alpha[m] * d[_place(k, m, count)]
+    return torch.stack(rest)
 
 
 def _solved(n: Tensor, d: Tensor, around: Tensor, ridge: Tensor, chance: Tensor) -> Tensor:
@@ -332,11 +379,19 @@ def _moments(size: tuple[int, int], nd: Callable[[slice], Tensor], alpha: Tensor
     """What a level needs the means of: n, d, the α of the level above, and the squared rest that this α leaves."""
     evidence, around = nd(rows), enlarged_rows(alpha, size, rows)
     count = len(alpha)
-    rest = [evidence[k] for k in range(count)]
-    for k in range(count):
-        for m in range(count):
-            rest[k] = rest[k] - around[m] * evidence[count + _place(k, m, count)]
-    return torch.cat([evidence, around, torch.stack(rest) ** 2])
+    return torch.cat([evidence, around, _left(evidence[:count], evidence[count:], around) ** 2])
+
+
+def _more_than_chance(tiles: Tensor) -> bool:
+    """Whether a mean over tiles is above 0 by more than its standard error, the outermost tiles pulled in.
+
+    One tile with a firefly in its witness can be the whole sum, and then neither it nor its standard error means
+    anything: the highest and the lowest half per cent of the tiles count as the next one.
+    """
+    ordered = tiles.flatten().sort().values
+    cut = int(_OUTERMOST * len(ordered))
+    pulled_in = ordered.clamp(float(ordered[cut]), float(ordered[-1 - cut]))
+    return float(pulled_in.mean()) > _standard_error(pulled_in)
 
 
 def _standard_error(tiles: Tensor) -> float:

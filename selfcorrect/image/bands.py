@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["TILE", "average", "bands", "enlarged", "enlarged_rows", "tile_means", "widened"]
+__all__ = ["TILE", "average", "bands", "enlarged", "enlarged_rows", "shares", "tile_means", "widened"]
 
 TILE = 16  # pixels; the side of tiles where none is given
 _BAND = 128  # rows; a multiple of every side
@@ -47,12 +47,18 @@ def tile_means(height: int, pixels: Pixels, side: int = TILE) -> Tensor:
 
 def average(means: Tensor, size: tuple[int, int], side: int = TILE) -> list[float]:
     """Means of K maps over all pixels of an image of this size, from those over its tiles."""
-    count = torch.ones_like(means[0])
-    count[-1] *= 1 - (len(count) * side - size[0]) / side
-    count[:, -1] *= 1 - (count.shape[1] * side - size[1]) / side
+    count = shares(means, size, side)
     weighted = (means * count).sum((1, 2)) / count.sum()
     values: list[float] = weighted.tolist()
     return values
+
+
+def shares(means: Tensor, size: tuple[int, int], side: int = TILE) -> Tensor:
+    """How full each tile of maps (K, h, w) is, (h, w): less than 1 at the far border of an image of this size."""
+    count = torch.ones_like(means[0])
+    count[-1] *= 1 - (len(count) * side - size[0]) / side
+    count[:, -1] *= 1 - (count.shape[1] * side - size[1]) / side
+    return count
 
 
 def enlarged_rows(means: Tensor, size: tuple[int, int], rows: slice) -> Tensor:
