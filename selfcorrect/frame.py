@@ -189,6 +189,12 @@ class Frame:
             frame._set_full(denoised_full)
         return frame
 
+    def with_candidate(self, candidate: Candidate) -> "Frame":
+        """This frame with one candidate more."""
+        frame = self._copy()
+        object.__setattr__(frame, "more", (*self.more, candidate))
+        return frame
+
     def to(self, device: str | torch.device) -> "Frame":
         """This frame with all its tensors on ``device``."""
         frame = self._copy()
