@@ -46,17 +46,16 @@ def picture(frame: Frame) -> Tensor:
     Noise would be taken for motion, so the G-buffers are the mean of both halves and the radiance is denoised.
     """
     full = frame.candidates[0].full
-    parts = [(full / (1 + full)).mean(-1)]
-    weights = [_SHARES[2]]
+    parts = [_SHARES[2] * (full / (1 + full)).mean(-1)]
+    used = _SHARES[2]
     if frame.albedo is not None:
-        parts.append(mean(frame.albedo).clamp(0, 1).mean(-1))
-        weights.append(_SHARES[0])
+        parts.append(_SHARES[0] * mean(frame.albedo).clamp(0, 1).mean(-1))
+        used += _SHARES[0]
     if frame.normal is not None:
         light = torch.tensor(_LIGHT, device=full.device)
-        parts.append((mean(frame.normal).clamp(-1, 1) @ light + 1) / 2)
-        weights.append(_SHARES[1])
-    total: Tensor = sum(part * weight for part, weight in zip(parts, weights, strict=True)) / sum(weights)
-    return total.clamp(0, 1)
+        parts.append(_SHARES[1] * (mean(frame.normal).clamp(-1, 1) @ light + 1) / 2)
+        used += _SHARES[1]
+    return (torch.stack(parts).sum(0) / used).clamp(0, 1)
 
 
 def optical_flow(image: Tensor, other: Tensor) -> Tensor:
