@@ -5,15 +5,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from selfcorrect import stages
 from selfcorrect.errors import FrameError
 from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
-from selfcorrect.image.bands import average, tile_means
-from selfcorrect.image.exposure import Scaled, scale_
+from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.train import Progress
@@ -104,7 +102,7 @@ def correct(
     if warm_start is not None and not any(stage.learns for stage in opened):
         learning = " or ".join(name for name, stage in stages.STAGES.items() if stage.learns)
         raise FrameError(f"expected the stage {learning} with a warm start, but got the stages {settings.stages}")
-    first = StageImages.of(frame.halves, given, settings.input_scale or _automatic_scale(frame))
+    first = StageImages.of(frame.halves, given, settings.input_scale or scale_to_one(given.halves))
     judge = _Judge(first, more) if settings.guard else None
     state, learned, seconds = first, None, dict[str, float]()
     for stage in opened:
@@ -134,17 +132,6 @@ def correct(
         input_scale=first.scale,
         start=learned.start if learned else Start(warm=False),
     )
-
-
-def _automatic_scale(frame: Frame) -> float:
-    """What brings the denoised frame's mean near 1; by the mean of roots, which a few bright pixels do not move."""
-    denoised = frame.candidates[0].halves
-
-    def roots(rows: slice) -> Tensor:
-        return torch.stack([half[rows].double().mean(-1).clamp(min=0).sqrt() for half in denoised])
-
-    root = sum(average(tile_means(frame.size[0], roots), frame.size)) / 2
-    return 1 / root**2 if root > 0 else 1.0
 
 
 class _Judge:

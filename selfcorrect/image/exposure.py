@@ -5,9 +5,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from selfcorrect.image.bands import bands
+from selfcorrect.image.bands import average, bands, tile_means
 
-__all__ = ["LARGEST", "Radiance", "Scaled", "scale_"]
+__all__ = ["LARGEST", "Radiance", "Scaled", "scale_", "scale_to_one"]
 
 LARGEST = 1e15  # keeps squared differences in a window finite in float32
 
@@ -42,3 +42,14 @@ def scale_(image: Tensor, factor: float) -> Tensor:
     for rows in bands(image.shape[0]):
         image[rows] = (image[rows].double() * factor).clamp(-largest, largest)
     return image
+
+
+def scale_to_one(halves: tuple[Radiance, Radiance]) -> float:
+    """What brings the mean of two denoised halves near 1: by the mean of roots, which few bright pixels hardly move."""
+    height, width = halves[0].shape[:2]
+
+    def roots(rows: slice) -> Tensor:
+        return torch.stack([half[rows].double().mean(-1).clamp(min=0).sqrt() for half in halves])
+
+    root = sum(average(tile_means(height, roots), (height, width))) / 2
+    return 1 / root**2 if root > 0 else 1.0

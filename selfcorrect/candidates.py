@@ -1,0 +1,94 @@
+"""Further denoised images of a frame, as candidates for the guard: only those that the frame has use for.
+
+A denoiser has more than one way to go about a frame, and which is best differs from frame to frame. A few crops tell,
+before the whole frame is denoised again: what the halves say of them is what the guard would say of the whole.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from selfcorrect.frame import Candidate, Frame, mean, prefiltered
+from selfcorrect.guard import Evidence, guard
+from selfcorrect.image.exposure import Scaled, scale_to_one
+from selfcorrect.image.tiles import Region
+
+__all__ = ["promises", "with_candidate", "worth"]
+
+Denoiser = Callable[..., Any]
+
+_SIDE = 128  # of a crop, pixels: a multiple of the guard's largest tile
+_CROPS = (3, 2)  # at most so many by so many
+_WORTH = 0.01  # of the error: a smaller gain is not worth a denoising
+
+
+def promises(frame: Frame, denoisers: Mapping[str, Denoiser]) -> dict[str, float]:
+    """What each denoiser's image promises to take off the error, as a share of it; 0 where nothing speaks for it.
+
+    Args:
+        frame: with its denoised halves.
+        denoisers: by name; as for :meth:`selfcorrect.Frame.denoise`, but for those that need both halves at once.
+    """
+    regions = _crops(frame.size)
+    z = [_stacked(half, regions) for half in frame.candidates[0].halves]
+    y = [_stacked(half, regions) for half in frame.color]
+    scale = scale_to_one((z[0], z[1]))
+
+    def scaled(images: list[Tensor]) -> tuple[Scaled, Scaled]:
+        return Scaled(images[0], scale), Scaled(images[1], scale)
+
+    found = {}
+    for name, denoiser in denoisers.items():
+        g = [torch.cat([_denoised(frame, i, denoiser, region) for region in regions]) for i in (0, 1)]
+        evidence = Evidence(scaled(y), scaled(z))
+        evidence.add(slice(0, len(g[0])), (scaled(g)[0][:], scaled(g)[1][:]))
+        full, image = mean((z[0], z[1])), mean((g[0], g[1]))
+        guarded = guard(evidence, Scaled(full, scale), [Scaled(image, scale)], scale=scale, out=torch.empty_like(full))
+        found[name] = max(-guarded.estimate.change, 0.0) if guarded.estimate.improved else 0.0
+    return found
+
+
+def worth(promise: float) -> bool:
+    """Whether a promise is worth denoising the whole frame."""
+    return promise > _WORTH
+
+
+def with_candidate(frame: Frame, name: str, denoiser: Denoiser) -> Frame:
+    """The frame with one candidate more: its halves and their mean, denoised by another denoiser."""
+    inputs = [(half.color, half.albedo, half.normal) for half in frame.halves]
+    inputs.append(tuple(None if a is None or b is None else mean((a, b)) for a, b in zip(*inputs, strict=True)))
+    a, b, full = (
+        torch.as_tensor(denoiser(color, **prefiltered(denoiser, albedo, normal))).clamp(min=0)
+        for color, albedo, normal in inputs
+    )
+    return frame.with_candidate(Candidate(name, (a, b), full))
+
+
+def _crops(size: tuple[int, int]) -> list[Region]:
+    """Regions of one size, spread evenly; the whole of a frame that is hardly larger."""
+    if min(size) < 2 * _SIDE:
+        return [(0, 0, *size)]
+    corners = [
+        [(length - _SIDE) * (2 * i + 1) // (2 * count) for i in range(count)]
+        for length, count in zip(size, _CROPS[:: 1 if size[0] > size[1] else -1], strict=True)
+    ]
+    return [(top, left, top + _SIDE, left + _SIDE) for top in corners[0] for left in corners[1]]
+
+
+def _stacked(image: Tensor, regions: list[Region]) -> Tensor:
+    return torch.cat([_cut(image, region) for region in regions])
+
+
+def _cut(image: Tensor, region: Region) -> Tensor:
+    top, left, bottom, right = region
+    return image[top:bottom, left:right].contiguous()
+
+
+def _denoised(frame: Frame, half: int, denoiser: Denoiser, region: Region) -> Tensor:
+    """A crop of one half, denoised."""
+    buffers = frame.halves[half]
+    albedo, normal = (None if b is None else _cut(b, region) for b in (buffers.albedo, buffers.normal))
+    color = _cut(buffers.color, region)
+    return torch.as_tensor(denoiser(color, **prefiltered(denoiser, albedo, normal))).clamp(min=0)
