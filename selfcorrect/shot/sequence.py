@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 
+from selfcorrect.buffers import TERMS
 from selfcorrect.correct import Result, correct
 from selfcorrect.frame import Frame
 from selfcorrect.settings import Settings
@@ -49,5 +50,5 @@ def correct_sequence(
 
 def follows(network: Network, frame: Frame) -> bool:
     """Whether the frame has the buffers of the one that the network was trained on."""
-    names = ("albedo", "visibility", "normal")
-    return network.traits.buffers == buffer_names(**{name: getattr(frame, name) is not None for name in names})
+    there = (term for term in TERMS if term.kind == "radiance" or getattr(frame, term.name) is not None)
+    return network.traits.buffers == buffer_names(there)
