@@ -37,13 +37,15 @@ class Viewer {
     this.divider = this.dividerElement();
     this.legend = make("div", { class: "legend" });
     this.inspector = make("div", { class: "inspector" });
+    const keys = [["1 – 9", "images"], ["space", "flips between the last two"], ["s o g", "slider, one image, side by side"], ["[ ]", "exposure"], ["+ −", "zoom"], ["0", "fit"], ["arrows", "move"]];
+    const hint = make("p", { class: "hint keys" }, ...keys.flatMap(([key, does]) => [make("kbd", {}, key), ` ${does} `]));
     const remark = [...root.children];
     root.append(
       make("div", { class: "bar" }, this.tabs),
       make("div", { class: "bar" }, this.modes, this.besideGroup, this.exposure.group,
         make("div", { class: "group" }, make("span", { class: "name" }, "Tone mapping"), curves),
         make("div", { class: "group" }, make("span", { class: "name" }, "Zoom"), ...zooms.map(([text, label, act]) => make("button", { type: "button", "aria-label": label, title: label, onclick: act }, text)), this.zoomOutput)),
-      this.stages, this.legend, ...remark, this.inspector,
+      this.stages, this.legend, ...remark, hint, this.inspector,
     );
     document.addEventListener("keydown", (event) => this.key(event));
     new ResizeObserver(() => this.draw()).observe(this.stages);
@@ -170,11 +172,11 @@ class Viewer {
   }
   drawLegend(shown) {
     const maps = [...new Set(shown)].filter((layer) => layer instanceof Falsecolour);
-    this.legend.replaceChildren(...maps.flatMap(({ label, colours, from, to, told }) => {
+    this.legend.replaceChildren(...maps.map(({ label, colours, from, to, told }) => {
       const bar = make("i", { "aria-hidden": true });
       bar.style.background = gradient(colours);
       const ends = colours === "signed" ? [percent(from), percent(to)] : [short(from), short(to)];
-      return [make("span", {}, `${label}: ${told}`), make("span", {}, ends[0]), bar, make("span", {}, ends[1])];
+      return make("span", {}, make("span", {}, `${label}: ${told}`), make("span", {}, ends[0]), bar, make("span", {}, ends[1]));
     }));
   }
   /** The pixel under the cursor; without a mouse the one in the middle. */
@@ -194,11 +196,10 @@ class Viewer {
       return make("tr", {}, make("th", { scope: "row" }, ...(layer instanceof Picture ? [swatch] : []), layer.label), ...told.map((v) => make("td", {}, v)));
     });
     const where = this.scale === 1 ? `Pixel ${x}, ${y}` : `Pixel about ${Math.round((x + 0.5) * this.scale)}, ${Math.round((y + 0.5) * this.scale)} of the frame`;
-    const keys = "Keys: 1 – 9 images, space flips between the last two, s slider, o one image, g side by side, [ ] exposure, + − zoom, 0 fits, arrows move.";
-    this.inspector.replaceChildren(
-      make("table", {}, make("caption", {}, `${where}${this.cursor ? "" : ", in the middle"}: linear radiance, red, green, blue`), make("tbody", {}, ...rows)),
-      make("p", { class: "hint keys" }, keys),
-    );
+    const head = ["", "red", "green", "blue"].map((name) => make("th", { scope: "col" }, name));
+    this.inspector.replaceChildren(make("table", {},
+      make("caption", {}, `${where}${this.cursor ? "" : " (middle)"}, linear`),
+      make("thead", {}, make("tr", {}, ...head)), make("tbody", {}, ...rows)));
   }
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || !this.layers.size) return;

@@ -41,7 +41,7 @@ def frame_page(
         HTML that needs no other file.
     """
     budget = limit - _ROOM
-    packed, factor = fitted({**images, **maps}, budget)
+    packed = fitted({**images, **maps}, budget)
     first = next(iter(images.values()))
     full = facts.get("size") or {"width": np.asarray(first).shape[1], "height": np.asarray(first).shape[0]}
     shown = next(iter(packed.values()))

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib import resources
@@ -17,7 +18,9 @@ __all__ = ["assembled", "facts_sections", "section", "table"]
 _JSON_ESCAPES = {ord("<"): "\\u003c", ord(">"): "\\u003e", ord("&"): "\\u0026", 0x2028: "\\u2028", 0x2029: "\\u2029"}
 
 
-def assembled(*, title: str, lead: str, summary: str, body: str, data: Mapping[str, Any], scripts: Sequence[str]) -> str:
+def assembled(
+    *, title: str, lead: str, summary: str, body: str, data: Mapping[str, Any], scripts: Sequence[str]
+) -> str:
     """A whole page.
 
     Args:
@@ -59,21 +62,22 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(one) for one in value]
-    if isinstance(value, float) and (value != value or abs(value) == float("inf")):
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Any]], classes: str = "") -> str:
-    """Rows of plain values, escaped; the first of each names it."""
+    """Rows of plain values, escaped; the first of each names it. Without a head where that is empty."""
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    headed = f"<thead><tr>{heads}</tr></thead>" if any(head) else ""
     lines = []
     for name, *values in rows:
         cells = "".join(f"<td>{escape(number(value))}</td>" for value in values)
         lines.append(f'<tr><th scope="row">{escape(number(name))}</th>{cells}</tr>')
     return (
         f'<div class="scroll"><table class="{classes}"><caption>{escape(caption)}</caption>'
-        f"<thead><tr>{heads}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
+        f"{headed}<tbody>{''.join(lines)}</tbody></table></div>"
     )
 
 
@@ -92,18 +96,18 @@ def facts_sections(facts: Mapping[str, Any]) -> str:
     if channels := facts.get("channels"):
         rows = [(role, ", ".join(names)) for role, names in channels.items()]
         rows += [(name, "the same at every pixel: not used") for name in facts.get("constant", ())]
-        parts.append(table("Channels", ("taken as", "channel"), rows))
+        parts.append(table("Channels", (), rows))
     if (repairs := facts.get("repairs")) is not None:
         those = [(n, r["non_finite"], r["negative"]) for n, r in repairs.items() if r["non_finite"] or r["negative"]]
         if those:
             parts.append(table("Repairs, in pixels", ("buffer", "NaN or infinite", "negative"), those))
         else:
-            parts.append('<p class="none"><strong>Repairs</strong> none: no NaN, infinite or negative pixel.</p>')
+            parts.append("<p><strong>Repairs</strong><br>None: no NaN, infinite or negative pixel.</p>")
     if seconds := facts.get("seconds"):
-        parts.append(table("Seconds", ("part", "s"), [(name, f"{value:.2f}") for name, value in seconds.items()]))
+        parts.append(table("Seconds", (), [(name, f"{value:.2f}") for name, value in seconds.items()]))
     work = {name: facts.get(name) for name in ("denoiser", "preset", "threads", "steps", "parameters", "version")}
     if any(value is not None for value in work.values()):
-        parts.append(table("Work", ("what", ""), [(k, v) for k, v in work.items() if v is not None]))
+        parts.append(table("Work", (), [(k, v) for k, v in work.items() if v is not None]))
     columns = f'<div class="columns">{"".join(parts)}</div>' if parts else ""
     return columns + settings_table(facts.get("settings"), facts.get("preset"))
 

@@ -85,12 +85,12 @@ def _predicted(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
 
 def reduced(image: Any, factor: int) -> Array:
     """Means over blocks of ``factor`` × ``factor`` pixels, smaller ones at the right and lower border; float32."""
-    values = np.asarray(image, dtype=np.float32)
+    values: Array = np.asarray(image, dtype=np.float32)
     for axis in (0, 1):
         starts = np.arange(0, values.shape[axis], factor)
-        counts = np.diff(np.append(starts, values.shape[axis])).astype(np.float32)
+        counts = np.diff(np.append(starts, values.shape[axis]))
         shape = [-1 if i == axis else 1 for i in range(values.ndim)]
-        values = np.add.reduceat(values, starts, axis=axis) / counts.reshape(shape)
+        values = np.add.reduceat(values, starts, axis=axis) / counts.astype(np.float32).reshape(shape)
     return values
 
 
@@ -105,11 +105,12 @@ def shrunk(image: Any, pixels: int = _KEPT_PIXELS) -> Array:
     while -(-height // factor) * -(-width // factor) > pixels:
         factor += 1
     small = values if factor == 1 else reduced(np.nan_to_num(np.clip(values, 0, 65504)), factor)
-    return np.clip(small, 0, 65504).astype(np.float16)
+    kept: Array = np.clip(small, 0, 65504).astype(np.float16)
+    return kept
 
 
-def fitted(images: Mapping[str, Any], budget: int) -> tuple[dict[str, Packed], int]:
-    """Images and maps of one size, packed into so many bytes together, and by what factor they were reduced for it.
+def fitted(images: Mapping[str, Any], budget: int) -> dict[str, Packed]:
+    """Images and maps of one size, packed into so many bytes together: rounded, then reduced, until they fit.
 
     Whole pixels are worth more than the last bits of a number: those go first.
     """
@@ -120,7 +121,7 @@ def fitted(images: Mapping[str, Any], budget: int) -> tuple[dict[str, Packed], i
         small = images if factor == 1 else {name: reduced(image, factor) for name, image in images.items()}
         packed = {name: pack(image, bits) for name, image in small.items()}
         if sum(len(one.data) for one in packed.values()) <= budget or max(_size(small)) == 1:
-            return packed, factor
+            return packed
     raise AssertionError("unreachable: an image of one pixel fits")
 
 

@@ -81,7 +81,7 @@ def shot_page(frames: Sequence[ShotFrame], facts: Mapping[str, Any], *, limit: i
     told, remark = [], ""
     images = {frame.number: fitted({**frame.images, **frame.maps}, budget // len(shown)) for frame in shown}
     if shown:
-        first = next(iter(images[shown[0].number][0].values()))
+        first = next(iter(images[shown[0].number].values()))
         remark = note(shown[0].facts["size"], first)
     for frame in frames:
         packed = images.get(frame.number)
@@ -93,8 +93,8 @@ def shot_page(frames: Sequence[ShotFrame], facts: Mapping[str, Any], *, limit: i
                 "error": (frame.facts.get("estimate") or {}).get("standard_error"),
                 "warm": (frame.facts.get("start") or {}).get("warm"),
                 "thumbnail": strip.get(frame.number),
-                "layers": layers(packed[0]) if packed else [],
-                "scale": frame.facts["size"]["width"] / next(iter(packed[0].values())).width if packed else 1,
+                "layers": layers(packed) if packed else [],
+                "scale": frame.facts["size"]["width"] / next(iter(packed.values())).width if packed else 1,
             }
         )
     rest = section("Frames", _table(frames)) + section("What was done", facts_sections(facts))
@@ -173,5 +173,4 @@ def _slices(frames: Sequence[ShotFrame], budget: int) -> dict[str, dict[str, Any
         stacked[name] = np.stack([row if len(row) == width else gap for row in rows])
     if not stacked:
         return {}
-    packed, _ = fitted(stacked, budget)
-    return {name: one._asdict() for name, one in packed.items()}
+    return {name: one._asdict() for name, one in fitted(stacked, budget).items()}

@@ -17,7 +17,7 @@ _MOST = 0.5  # of the gain
 
 
 def summary(estimate: Mapping[str, Any] | None, place: str = "") -> str:
-    """"Error about 31 % lower, mostly in the highlights", from the guard's estimate and :func:`where`."""
+    """ "Error about 31 % lower, mostly in the highlights", from the guard's estimate and :func:`where`."""
     if estimate is None:
         return "No estimate of the error: the guard was off"
     if not estimate["improved"]:
@@ -55,7 +55,7 @@ def luminance(image: Any) -> NDArray[np.float64]:
 
 
 def change(after: float, before: float) -> str:
-    """"−31 %"."""
+    """ "−31 %"."""
     if not (before > 0 and math.isfinite(after)):
         return "–"
     return percent(after / before - 1)
