@@ -7,7 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from selfcorrect import exr, files, tradeoff
-from selfcorrect.cli.runner import Runner, add_halves, add_run_flags, answer, log, mapping
+from selfcorrect.cli import flags
+from selfcorrect.cli.runner import Runner
+from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import publish
@@ -22,7 +24,7 @@ _ERROR = "estimated relMSE over that of the denoised image"
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("bench", help="what each second buys on this frame, and the preset to take")
-    add_halves(parser)
+    flags.add_halves(parser)
     parser.add_argument(
         "--points",
         nargs="+",
@@ -35,7 +37,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--csv", metavar="OUT.csv", help="keep the measurements here, after each point")
     parser.add_argument("--plot", metavar="OUT.png", help="seconds against error (needs the extra bench)")
-    add_run_flags(parser)
+    flags.add_run_flags(parser)
     parser.set_defaults(run=_bench)
 
 
@@ -79,13 +81,12 @@ def _points(options: argparse.Namespace, base: Settings) -> list[Point]:
 
 def _frame(options: argparse.Namespace, runner: Runner, halves: Sequence[str], *, given: bool) -> Frame:
     """A frame with its denoised halves; ``given``: those of the flags, where there are any."""
-    names = ("denoised_a", "denoised_b", "denoised") if given else ()
-    denoised = {name: getattr(options, name) for name in names}
+    denoised = flags.denoised(options) if given else {}
     start = time.perf_counter()
-    loaded = files.load(files.Sources(halves[0], halves[1], **denoised, mapping=mapping(options)))
-    frame, denoiser = runner.prepare(loaded, {})
-    log(f"read and denoised ({denoiser}) in {time.perf_counter() - start:.1f} s")
-    return frame.to(options.device)
+    loaded = files.load(files.Sources(halves[0], halves[1], **denoised, mapping=flags.mapping(options)))
+    prepared = runner.prepare(loaded, start)
+    log(f"read and denoised ({prepared.facts.denoiser}) in {time.perf_counter() - start:.1f} s")
+    return prepared.frame.to(options.device)
 
 
 def _told(m: Measurement) -> str:

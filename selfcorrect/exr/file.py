@@ -85,7 +85,7 @@ class ExrFile:
 
     @cached_property
     def _places(self) -> dict[str, tuple[int, str]]:
-        views = self.parts[0].header.get("multiView", [])
+        views = header.views(self.parts[0].attributes)
         full = channels.full_names([(part.name, list(part.channels)) for part in self.parts], views)
         return {
             name: (index, channel)

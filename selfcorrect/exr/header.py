@@ -17,7 +17,7 @@ import numpy as np
 
 from selfcorrect.errors import FileError
 
-__all__ = ["MAGIC", "Attribute", "Channel", "Header", "Window", "check", "parse", "readable", "restore"]
+__all__ = ["MAGIC", "Attribute", "Channel", "Header", "Window", "check", "parse", "readable", "restore", "views"]
 
 MAGIC = b"v/1\x01"
 """The first bytes of every OpenEXR file."""
@@ -100,6 +100,29 @@ class Header:
     data_window: Window
     display_window: Window
     compression: int
+
+    @property
+    def name(self) -> str:
+        """The part's name; empty in most single-part files."""
+        attribute = self.attributes.get("name")
+        return "" if attribute is None else attribute.data.decode("utf-8", "replace")
+
+    @property
+    def views(self) -> list[str]:
+        """The views that a stereo file names."""
+        return views(self.attributes)
+
+
+def views(attributes: Mapping[str, Attribute]) -> list[str]:
+    """The views that these attributes of a file's first part name, in ``multiView``; none in most files."""
+    attribute = attributes.get("multiView")
+    data = b"" if attribute is None or attribute.type != "stringvector" else attribute.data
+    names = []
+    while len(data) >= 4:
+        length = int.from_bytes(data[:4], "little")
+        names.append(data[4 : 4 + length].decode("utf-8", "replace"))
+        data = data[4 + length :]
+    return names
 
 
 def parse(data: bytes | memoryview, file: str) -> tuple[list[Header], int]:

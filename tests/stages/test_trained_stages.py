@@ -18,7 +18,7 @@ from selfcorrect.cli import memory
 from selfcorrect.errors import FileError, FrameError, SettingsError
 from selfcorrect.files import Sources
 from selfcorrect.frame import mean
-from selfcorrect.shot import run as shot
+from selfcorrect.shot.recipe import recipe
 from selfcorrect.stages import STAGES, opened, weights
 from selfcorrect.stages.deep_combiner import DeepCombiner, combine_whole, feature_planes
 from selfcorrect.stages.deep_combiner_4 import SubImages
@@ -402,7 +402,7 @@ def test_other_weights_are_another_recipe(renders: list[str], files: dict[str, s
     for name in ("combiner_weights", "combiner_4_weights"):
         own.write_bytes(Path(files[name]).read_bytes())
         chosen = settings({}, combiner_weights=str(own))
-        recipes.append(shot.recipe(Sources(*renders[:2]), shot.Habits(chosen, {})))
+        recipes.append(recipe(Sources(*renders[:2]), chosen, {}))
     assert recipes[0] != recipes[1]
 
 
