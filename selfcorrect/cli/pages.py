@@ -89,6 +89,12 @@ class FramePage:
         self._images: dict[str, Any] = {}
         self._maps: dict[str, Any] = {}
 
+    @classmethod
+    def at(cls, path: str | None) -> "FramePage | None":
+        """A page to be written here, or None where there is to be none."""
+        page = target(path)
+        return None if page is None else cls(page)
+
     def gather(self, frame: Frame, result: Result) -> None:
         """Keep what is to be looked at."""
         self._images = {name: report.shrunk(image) for name, image in _images(frame, result.image).items()}
@@ -108,6 +114,12 @@ class ShotPage:
         self._kept = looked_at(numbers)
         self._pictures: dict[int, dict[str, Any]] = {}
         self._frames: list[report.ShotFrame] = []
+
+    @classmethod
+    def at(cls, path: str | None, numbers: Sequence[int]) -> "ShotPage | None":
+        """A page to be written here, or None where there is to be none."""
+        page = target(path)
+        return None if page is None else cls(page, numbers)
 
     def gather(self, number: int) -> Gather:
         """What keeps a frame of this number."""

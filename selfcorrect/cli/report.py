@@ -9,8 +9,8 @@ from torch import Tensor
 
 import denoisers
 from selfcorrect import exr, files, metrics, report
-from selfcorrect.cli import pages
-from selfcorrect.cli.runner import add_halves, log, mapping
+from selfcorrect.cli import flags, pages
+from selfcorrect.cli.terminal import log
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.frame import Frame, mean
 from selfcorrect.image.repair import repaired
@@ -24,7 +24,7 @@ _AGAIN = tuple(name for name in denoisers.names() if ":" not in name)
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("report", help="a page to look at a corrected frame, for any browser")
-    add_halves(parser)
+    flags.add_halves(parser)
     parser.add_argument("corrected", metavar="OUT.exr", help="what `selfcorrect frame` wrote; with --aov, it has maps")
     parser.add_argument("-o", "--output", required=True, metavar="PAGE.html")
     parser.add_argument("--reference", metavar="REF.exr", help="a reference to look at and to measure against")
@@ -38,8 +38,8 @@ def _report(options: argparse.Namespace) -> None:
     page = exr.check_target(options.output, ".html")
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    given = {name: getattr(options, name) for name in ("denoised_a", "denoised_b", "denoised")}
-    loaded = files.load(files.Sources(options.a, options.b, **given, mapping=mapping(options)))
+    sources = files.Sources(options.a, options.b, **flags.denoised(options), mapping=flags.mapping(options))
+    loaded = files.load(sources)
     frame, out = loaded.frame, exr.load_half(options.corrected)
     facts = pages.facts_of(out.file)
     images = {"corrected": _like(frame, options.a, out.buffers["color"], options.corrected)}
