@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -80,6 +81,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     there["llvm"] = any(item.get_closest_marker("llvm") for item in items) and has_llvm()
     if os.environ.get("SELFCORRECT_REQUIRE_SHARED") and not any(item.get_closest_marker("shared") for item in items):
         raise pytest.UsageError("expected tests that need the development frames, but got none")
+    there["browser"] = all(shutil.which(program) for program in ("chromium", "chromedriver"))
     lacking = [item for item in items if any(item.get_closest_marker(need) and not there[need] for need in there)]
     config.hook.pytest_deselected(items=lacking)
     items[:] = [item for item in items if item not in lacking]

@@ -140,7 +140,7 @@ class ShotPage:
     def told(self, outcome: Outcome) -> None:
         """Keep what became of a frame."""
         pictures = self._pictures.pop(outcome.frame, {}) if outcome.kind == "written" else {}
-        facts = dict(outcome.report or {"reason": outcome.reason})
+        facts = {"reason": outcome.reason} if outcome.report is None else outcome.report.to_dict()
         if outcome.kind == "skipped":
             with contextlib.suppress(SelfcorrectError):  # the page is no reason to fail
                 half = exr.load_half(outcome.output)
