@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,7 +69,7 @@ def shared() -> Path:
     return shared_folder()
 
 
-LACKED = ("shared", "blender", "llvm")
+LACKED = ("shared", "blender", "browser", "llvm")
 LEFT_OUT = pytest.StashKey[dict[str, list[str]]]()
 """Of each need that this machine lacks, the names of the tests left out for it."""
 
@@ -80,8 +81,9 @@ def needs(item: pytest.Item) -> list[str]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests of what this machine cannot have: the development frames, Blender, LLVM; and no others."""
+    """Leave out the tests of what this machine cannot have: the development frames, Blender, a browser, LLVM; and no others."""
     there = {"shared": shared_folder().is_dir(), "blender": HAS_BLENDER}
+    there["browser"] = all(shutil.which(program) for program in ("chromium", "chromedriver"))
     there["llvm"] = any("llvm" in needs(item) for item in items) and variants.failure() is None
     left_out: dict[str, list[str]] = {}
     lacking = []
@@ -111,6 +113,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """One line for each thing that this machine lacks: the tests left out for it, by name."""
     reasons = {"shared": "no development frames", "blender": "no package bpy for this Python"}
+    reasons["browser"] = "no chromium and chromedriver on the PATH"
     for need, names in config.stash.get(LEFT_OUT, {}).items():
         why = reasons.get(need) or variants.refusal("Mitsuba")
         terminalreporter.write_line(f"left out: {', '.join(dict.fromkeys(names))}: {why}")
