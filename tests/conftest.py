@@ -81,7 +81,7 @@ def needs(item: pytest.Item) -> list[str]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests of what this machine cannot have: the development frames, Blender, a browser, LLVM; and no others."""
+    """Leave out the tests of what this machine cannot have (see LACKED), and no others."""
     there = {"shared": shared_folder().is_dir(), "blender": HAS_BLENDER}
     there["browser"] = all(shutil.which(program) for program in ("chromium", "chromedriver"))
     there["llvm"] = any("llvm" in needs(item) for item in items) and variants.failure() is None
