@@ -18,13 +18,14 @@ ORDER = (
     {"guard", "independence", "metrics"},
     {"correct"},
     {"files", "facts"},
-    {"shot", "tradeoff"},
+    {"shot", "tradeoff", "report"},
     {"cli"},
 )
 """The rooms, the lowest first; those of one level know nothing of each other, but for the lowest level."""
 
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
+BUILD = {Path("kernel/cross_bilateral/rows.py")}  # run by the build, which reads what it prints
 OUTSIDE = {Path("__init__.py"), Path("__main__.py")}  # what the package shows of itself, and how it is started
 
 
@@ -77,7 +78,7 @@ def test_no_module_imports_from_a_room_above_it() -> None:
 
 
 def test_only_the_command_prints() -> None:
-    others = [module for module in MODULES if room_of(module) != "cli"]
+    others = [module for module in MODULES if room_of(module) != "cli" and module not in BUILD]
     assert [module for module in others if prints((PACKAGE / module).read_text(encoding="utf-8"))] == []
 
 

@@ -4,13 +4,13 @@ import argparse
 from collections.abc import Sequence
 from typing import NoReturn
 
-from selfcorrect.cli import bench, combine, compare, demo, frame, inspect, sequence
+from selfcorrect.cli import bench, combine, compare, demo, frame, inspect, report, sequence
 from selfcorrect.cli.terminal import log
 from selfcorrect.errors import SelfcorrectError, SettingsError
 
 __all__ = ["main"]
 
-_COMMANDS = (frame, sequence, bench, inspect, compare, combine, demo)
+_COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, demo)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

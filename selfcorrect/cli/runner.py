@@ -96,6 +96,7 @@ class Runner:
         began: float | None = None,
         stop: Callable[[], bool] | None = None,
         show: Callable[[Frame], None] | None = None,
+        gather: Callable[[Frame, Result], None] | None = None,
         more: Mapping[str, Any] | None = None,
     ) -> Corrected:
         """Denoise and correct a frame.
@@ -107,6 +108,7 @@ class Runner:
             began: when the work on it began.
             stop: says when to end training.
             show: called with the denoised frame.
+            gather: called with it and the result.
             more: what else to keep in the output's attributes.
         """
         began = time.perf_counter() if began is None else began
@@ -123,6 +125,8 @@ class Runner:
                 opened=self._stages,
                 extra=extra,
             )
+        if gather is not None:
+            gather(frame, result)
         corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, more)
         return Corrected(loaded.origin, _outputs(result, self._options.aov), result.network, corrected, began)
 

@@ -4,7 +4,7 @@ import argparse
 from functools import partial
 from typing import Any
 
-from selfcorrect.cli import flags
+from selfcorrect.cli import flags, pages
 from selfcorrect.cli.runner import Runner
 from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import FrameError
@@ -36,6 +36,7 @@ def add(commands: Any) -> None:
         "--save-state", metavar="STATE.safetensors", help="keep the last frame's state here; with ####, that of each"
     )
     parser.add_argument("--fail-fast", action="store_true", help="end with the first frame that fails")
+    pages.add_flag(parser)
     flags.add_run_flags(parser)
     parser.set_defaults(run=_sequence)
 
@@ -51,6 +52,7 @@ def _sequence(options: argparse.Namespace) -> int:
         **flags.denoised(options),
         mapping=flags.mapping(options),
     )
+    page = pages.ShotPage.at(options.report, frames)
     runner = Runner(options, given=options.denoised_a is not None)
     how = shot.Options(
         runner.settings,
@@ -64,11 +66,14 @@ def _sequence(options: argparse.Namespace) -> int:
 
     def one(job: shot.Job) -> shot.Done:
         more = {"frame": job.frame, "recipe": job.recipe}
-        corrected = runner.correct(job.loaded, job.link.network, job.meanwhile, more=more)
+        gather = None if page is None else page.gather(job.frame)
+        corrected = runner.correct(job.loaded, job.link.network, job.meanwhile, gather=gather, more=more)
         log(f"frame {job.frame}: {corrected.facts.start_line()}")
         return shot.Done(corrected.network, partial(runner.write, job.output, corrected))  # the frame is let go
 
     def report(outcome: shot.Outcome) -> None:
+        if page is not None:
+            page.told(outcome)
         if outcome.kind != "written":
             log(f"frame {outcome.frame}: {outcome.kind}: {outcome.reason or outcome.output}")
         if options.json:
@@ -77,7 +82,11 @@ def _sequence(options: argparse.Namespace) -> int:
                 told = outcome.report.to_dict()
             answer({"frame": outcome.frame, "outcome": outcome.kind, **told})
 
-    failed = shot.run(work, how, one, report, log)
+    try:
+        failed = shot.run(work, how, one, report, log)
+    finally:  # also after Ctrl-C: what is done can be looked at
+        if page is not None:
+            page.write(options.output, runner.settings, {"preset": options.preset, "denoiser": runner.denoiser})
     if failed:
         log(f"selfcorrect: {failed} of {len(frames)} frames failed")
     return failed

@@ -17,7 +17,7 @@ Whether a network that fits is also the better start, which it is not after a cu
 
 from typing import NamedTuple
 
-from selfcorrect.buffers import INPUTS
+from selfcorrect.buffers import TERMS
 from selfcorrect.frame import Frame
 from selfcorrect.stages.core.network import Network, buffer_names
 
@@ -94,5 +94,5 @@ class Chain:
 
 def fits(network: Network, frame: Frame) -> bool:
     """Whether the frame has the buffers of the one that the network was trained on."""
-    features = {buffer.name: getattr(frame, buffer.name) is not None for buffer in INPUTS if buffer.kind == "feature"}
-    return network.traits.buffers == buffer_names(**features)
+    there = (term for term in TERMS if term.kind == "radiance" or getattr(frame, term.name) is not None)
+    return network.traits.buffers == buffer_names(there)

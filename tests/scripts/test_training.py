@@ -271,9 +271,8 @@ class TestEvaluate:
 
 
 @pytest.mark.mitsuba
-@pytest.mark.llvm
 def test_rendered_views_go_all_the_way(tmp_path: Path) -> None:
-    """Two procedural rooms, really rendered, trained on and measured."""
+    """Two procedural rooms, really rendered by whichever variant works here, trained on and measured."""
     data = tmp_path / "data"
     few = ("--views", 1, "--validation", 1, "--size", 32, "--reference-spp", 4, "--workers", 1)
     (tmp_path / "no scenes").mkdir()
