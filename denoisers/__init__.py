@@ -16,7 +16,7 @@ from types import ModuleType
 from denoisers.host import Denoise, DualPlugin, Plugin
 from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
-__all__ = ["PACKAGED", "Denoise", "DualPlugin", "Plugin", "create", "default", "names"]
+__all__ = ["PACKAGED", "Denoise", "DualPlugin", "Plugin", "create", "default", "names", "variants"]
 
 PACKAGED = Path(__file__).resolve().parent / "weights" / "denoiser.onnx"
 """The project's own model: ``onnx`` without a path."""
@@ -45,6 +45,16 @@ def default() -> str:
         if importlib.util.find_spec(package) is not None:
             return name
     return "joint-bilateral"
+
+
+def variants(spec: str) -> tuple[str, ...]:
+    """Return the other ways in which a denoiser can go about a frame, as specifications; most have none.
+
+    >>> variants("oidn")
+    ('oidn:fast', 'oidn:none')
+    """
+    modes = ("oidn", "oidn:fast", "oidn:none")
+    return tuple(mode for mode in modes if mode != spec) if spec in modes else ()
 
 
 def create(spec: str, *, threads: int | None = None, scratch: int | None = None) -> Denoise:

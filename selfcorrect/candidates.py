@@ -15,13 +15,15 @@ from selfcorrect.guard import Evidence, guard
 from selfcorrect.image.exposure import Scaled, scale_to_one
 from selfcorrect.image.tiles import Region
 
-__all__ = ["promises", "with_candidate", "worth"]
+__all__ = ["WORTH", "promises", "with_candidate", "with_candidates"]
 
 Denoiser = Callable[..., Any]
 
+WORTH = 0.01
+"""Share of the error: a smaller gain is not worth a denoising of the whole frame."""
+
 _SIDE = 128  # of a crop, pixels: a multiple of the guard's largest tile
 _CROPS = (3, 2)  # at most so many by so many
-_WORTH = 0.01  # of the error: a smaller gain is not worth a denoising
 
 
 def promises(frame: Frame, denoisers: Mapping[str, Denoiser]) -> dict[str, float]:
@@ -50,20 +52,37 @@ def promises(frame: Frame, denoisers: Mapping[str, Denoiser]) -> dict[str, float
     return found
 
 
-def worth(promise: float) -> bool:
-    """Whether a promise is worth denoising the whole frame."""
-    return promise > _WORTH
+def with_candidates(frame: Frame, denoisers: Mapping[str, Denoiser], *, every: bool) -> tuple[Frame, dict[str, float]]:
+    """The frame with the images of further denoisers as candidates; and what each promised.
+
+    Args:
+        frame: with its denoised halves.
+        denoisers: by name.
+        every: take all of them; otherwise those whose promise is worth a denoising of the whole frame.
+    """
+    found = promises(frame, denoisers)
+    for name, promise in found.items():
+        if every or promise > WORTH:
+            frame = with_candidate(frame, name, denoisers[name])
+    return frame, found
 
 
 def with_candidate(frame: Frame, name: str, denoiser: Denoiser) -> Frame:
     """The frame with one candidate more: its halves and their mean, denoised by another denoiser."""
-    inputs = [(half.color, half.albedo, half.normal) for half in frame.halves]
-    inputs.append(tuple(None if a is None or b is None else mean((a, b)) for a, b in zip(*inputs, strict=True)))
-    a, b, full = (
+    a, b = frame.halves
+    images = [
         torch.as_tensor(denoiser(color, **prefiltered(denoiser, albedo, normal))).clamp(min=0)
-        for color, albedo, normal in inputs
-    )
-    return frame.with_candidate(Candidate(name, (a, b), full))
+        for color, albedo, normal in (
+            (a.color, a.albedo, a.normal),
+            (b.color, b.albedo, b.normal),
+            (mean((a.color, b.color)), _mean(a.albedo, b.albedo), _mean(a.normal, b.normal)),
+        )
+    ]
+    return frame.with_candidate(Candidate(name, (images[0], images[1]), images[2]))
+
+
+def _mean(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    return None if a is None or b is None else mean((a, b))
 
 
 def _crops(size: tuple[int, int]) -> list[Region]:

@@ -34,6 +34,8 @@ class Denoised:
         repairs: by buffer, how many pixels were changed on the way in.
         constant: the G-buffers that are the same at every pixel, and not used.
         seconds: of reading and denoising.
+        promises: by name of a further denoiser, the share of the error that its image promised to take off.
+        candidates: the further images that the guard may blend in.
     """
 
     denoiser: str
@@ -42,6 +44,8 @@ class Denoised:
     repairs: Mapping[str, Repairs]
     constant: list[str]
     seconds: Mapping[str, float]
+    promises: Mapping[str, float] = field(default_factory=dict)
+    candidates: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -51,9 +55,19 @@ class Denoised:
         channels: Mapping[str, list[str]],
         seconds: Mapping[str, float],
         repairs: Mapping[str, Repairs],
+        promises: Mapping[str, float] | None = None,
     ) -> "Denoised":
         """Those of a denoised frame; ``repairs`` are those of images beyond its buffers."""
-        return cls(denoiser, channels, frame.size, {**frame.repairs, **repairs}, list(frame.constant), dict(seconds))
+        return cls(
+            denoiser,
+            channels,
+            frame.size,
+            {**frame.repairs, **repairs},
+            list(frame.constant),
+            dict(seconds),
+            dict(promises or {}),
+            tuple(candidate.name for candidate in frame.more),
+        )
 
     def lines(self) -> list[str]:
         """For the log: what was not used, and what was repaired."""
@@ -63,7 +77,12 @@ class Denoised:
             for name, counts in self.repairs.items()
             if any(counts)
         ]
-        return unused + repaired
+        further = [
+            f"candidate {name}: {'taken' if name in self.candidates else 'left out'}, a few crops promise "
+            f"{100 * promise:.0f} % less error"
+            for name, promise in self.promises.items()
+        ]
+        return unused + repaired + further
 
 
 @dataclass(frozen=True)
@@ -174,6 +193,10 @@ class Written:
             "size": {"width": width, "height": height},
             "repairs": {name: counts._asdict() for name, counts in before.repairs.items()},
             "constant": before.constant,
+            "candidates": {
+                name: {"promise": promise, "taken": name in before.candidates}
+                for name, promise in before.promises.items()
+            },
             "input_scale": facts.input_scale,
             "steps": facts.steps,
             "parameters": facts.parameters,

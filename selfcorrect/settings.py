@@ -127,6 +127,13 @@ class Settings:
     crossed_weights: bool = _setting(
         False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
+    candidates: str = _setting(
+        "none",
+        "further denoised images, of the denoiser's other modes, that the guard may blend in: none; auto, those that a "
+        "few crops ask for; or all",
+        "not in the paper; scripts/bench/candidates.py measures it",
+        choices=("none", "auto", "all"),
+    )
     time_budget: float = _setting(
         0.0, "seconds for the whole frame: training takes what the rest leaves; 0 sets none", "the user's", unit="s"
     )
@@ -180,11 +187,14 @@ class Settings:
             guard=True,
             crossed_weights=True,
             precision="bf16",
+            candidates="auto",
         )
         return {
             "balanced": balanced,
-            "fast": replace(balanced, steps=50, warm_steps=17, learning_rate=5e-3, warm_learning_rate=2.5e-3),
-            "best": replace(balanced, batch=16, visits=128),
+            "fast": replace(
+                balanced, steps=50, warm_steps=17, learning_rate=5e-3, warm_learning_rate=2.5e-3, candidates="none"
+            ),
+            "best": replace(balanced, batch=16, visits=128, candidates="all"),
             "paper": cls(),
         }
 

@@ -16,7 +16,7 @@ ORDER = (
     {"frame", "exr"},
     {"stages"},
     {"guard", "independence", "metrics"},
-    {"correct"},
+    {"correct", "candidates", "history"},
     {"files", "facts"},
     {"shot", "tradeoff", "report"},
     {"cli"},

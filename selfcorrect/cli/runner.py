@@ -10,6 +10,7 @@ import torch
 
 import denoisers
 from selfcorrect import facts, files, stages
+from selfcorrect.candidates import with_candidates
 from selfcorrect.cli import flags
 from selfcorrect.cli.terminal import Progress, log
 from selfcorrect.correct import COLOR_OUTPUT, Result, correct
@@ -78,14 +79,22 @@ class Runner:
         self._told: dict[str, list[str]] = {}
         self._denoise = None
         if options.denoiser is not None or not given:
-            self._denoise = denoisers.create(
-                options.denoiser or denoisers.default(), threads=options.threads, scratch=scratch
-            )
+            self._denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
+        self._further = {}
+        if self._denoise is not None and self.settings.guard and self.settings.candidates != "none":
+            self._further = {
+                spec: denoisers.create(spec, threads=options.threads, scratch=scratch)
+                for spec in denoisers.variants(self._spec)
+            }
 
     @property
     def denoiser(self) -> str:
         """Who denoises, unless there are denoised halves beside."""
-        return "given" if self._denoise is None else self._options.denoiser or denoisers.default()
+        return "given" if self._denoise is None else self._spec
+
+    @property
+    def _spec(self) -> str:
+        return self._options.denoiser or denoisers.default()
 
     def correct(
         self,
@@ -143,18 +152,19 @@ class Runner:
         self._told = channels
         for doubt in doubts(frame):
             log(f"warning: {doubt}")
-        denoiser = "given"
+        denoiser, promises = "given", dict[str, float]()
         if frame.denoised is None or self._options.denoiser is not None:  # who is named beats files found beside
             denoiser, start = self.denoiser, time.perf_counter()
             log(f"denoiser: {denoiser}")
             assert self._denoise is not None  # created above, in every case that gets here
             frame = frame.denoise(self._denoise, full=frame.denoised_full is None)
             extra = {name: images.denoise(frame, self._denoise) for name, images in extra.items()}
+            frame, promises = with_candidates(frame, self._further, every=self.settings.candidates == "all")
             seconds["denoise"] = time.perf_counter() - start
         else:
             self._check_denoiser(" as the halves' files hold denoised images and those of both must be alike,")
         repairs = {name: counts for images in extra.values() for name, counts in images.repairs.items()}
-        known = facts.Denoised.of(frame, denoiser, channels, seconds, repairs)
+        known = facts.Denoised.of(frame, denoiser, channels, seconds, repairs, promises)
         for line in known.lines():
             log(line)
         return Prepared(frame, extra, known)
