@@ -53,8 +53,8 @@ def create(spec: str, *, threads: int | None = None, scratch: int | None = None)
     Args:
         spec: one of the forms that :func:`names` returns.
         threads: CPU threads of ``oidn``, ``onnx``, ``joint-bilateral``, ``nlm`` and ``nfor``, at least 1; None
-            leaves the number to them. A command and a user's class see to their own threads.
-        scratch: bytes that ``oidn`` may take beside its images; the others see to their own memory.
+            leaves the number to them. A command and a user's class choose their own threads.
+        scratch: bytes that ``oidn`` may take beside its images; the others manage their own memory.
 
     Raises:
         DenoiserError: the specification is unknown, or the model, the command or the class does not fit.

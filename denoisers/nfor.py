@@ -2,8 +2,8 @@
 
 1. Each feature is freed of its noise by non-local means in itself.
 2. In a window around every pixel the radiance is fitted, to first order, by the features; how much a neighbour counts
-   is told by non-local means of the radiance. Every pixel takes the mean of the models around it.
-3. Step 2 is done with two bandwidths. The other half, which neither has seen, tells which has the smaller error; its
+   is given by non-local means of the radiance. Every pixel takes the mean of the models around it.
+3. Step 2 is done with two bandwidths. The other half, which neither has seen, shows which has the smaller error; its
    evidence is smoothed over some pixels, as is the choice.
 
 The paper fits each half with weights of the other. Here a half's weights are its own: then it is independent of the

@@ -22,7 +22,7 @@ _SCRATCH = 3 * 2**29  # bytes
 class Oidn:
     """OIDN's ``RT`` filter on the CPU, HDR on, at its default (high) quality.
 
-    OIDN learnt no model for a normal without an albedo: such a frame is denoised from its colour alone.
+    OIDN has no model for a normal without an albedo: such a frame is denoised from its colour alone.
     The same input gives the same bits whatever was denoised before; another number of threads moves the
     result by some 1e-6 of its value.
     """
@@ -46,10 +46,9 @@ class Oidn:
         Args:
             threads: of the CPU; None leaves the number to OIDN.
             scratch: bound of the filter's own memory, bytes: it goes through the image in tiles, with the same bits.
-                Less than some 0.34 GiB is not to be had. Left to itself it takes 1.1 GiB of 1920×1080, 2.9 GiB of
-                7680×4320.
+                It takes some 0.34 GiB at least. Left to itself it takes 1.1 GiB of 1920×1080, 2.9 GiB of 7680×4320.
             name: what messages call it.
-            clean_features: OIDN's ``cleanAux``: albedo and normal are taken for free of noise, their detail is kept.
+            clean_features: OIDN's ``cleanAux``: albedo and normal are taken for noise-free, their detail is kept.
         """
         self.name = name
         self.scratch = scratch or _SCRATCH

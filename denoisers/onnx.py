@@ -4,7 +4,7 @@ A model fits if it has
 
 - inputs named ``color`` and, if it uses them, ``albedo`` and ``normal``, of 3 channels each; or one input
   of any name with 3, 6 or 9 channels, in the order colour, albedo, normal. A model that takes a feature
-  needs it: a frame without it is refused, for a feature of zeros would be a lie, unless the custom metadata
+  needs it: a frame without it is refused, since zeros are not what it was trained on, unless the custom metadata
   key ``optional`` names it (such as ``albedo normal``): then the model was trained with zeros for what lacks;
 - for each input the layout NCHW or NHWC with N = 1 (or dynamic): NCHW if the second dimension is the
   number of channels, else NHWC if the fourth is. Height and width are dynamic or fixed;
@@ -79,7 +79,7 @@ class Onnx:
         if not Path(path).is_file():
             raise FileError(f"{path}: expected an ONNX model, but found no such file")
         options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3  # errors come as exceptions; warnings would go past us to stderr
+        options.log_severity_level = 3  # errors come as exceptions; warnings would go straight to stderr
         if threads is not None:
             options.intra_op_num_threads = threads
         try:

@@ -1,4 +1,4 @@
-"""Every error that a user can mend.
+"""Every error that a user can fix.
 
 ::
 
@@ -10,7 +10,7 @@
     ├── DenoiserError           a denoiser that is unknown, does not fit, or failed
     └── MissingPackageError     an optional package; the message carries the command that installs it
 
-A message is one line: «expected X, but got Y», with the file and the channel named, and the mend.
+A message is one line: «expected X, but got Y», with the file and the channel named, and the fix.
 """
 
 __all__ = [
@@ -25,7 +25,7 @@ __all__ = [
 
 
 class SelfcorrectError(Exception):
-    """Base of all errors that selfcorrect raises for input that a user can mend."""
+    """Base of all errors that selfcorrect raises for input that a user can fix."""
 
 
 class FileError(SelfcorrectError):

@@ -29,7 +29,7 @@ class Sources:
         b: half b.
         denoised_a: denoised half a, where the user has it.
         denoised_b: denoised half b.
-        denoised: denoised mean of both halves.
+        denoised_full: denoised mean of both halves.
         mapping: role → channel, for what no table knows.
     """
 
@@ -37,8 +37,13 @@ class Sources:
     b: str
     denoised_a: str | None = None
     denoised_b: str | None = None
-    denoised: str | None = None
+    denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
+
+    @property
+    def inputs(self) -> tuple[str | None, ...]:
+        """Every file, or None where there is none: the halves, their denoised images, the full denoised image."""
+        return self.a, self.b, self.denoised_a, self.denoised_b, self.denoised_full
 
 
 @dataclass(frozen=True)
@@ -105,8 +110,8 @@ def load(sources: Sources) -> Loaded:
     if denoised:
         pairs["denoised"] = denoised
         taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
-    if sources.denoised:
-        pairs["denoised_full"] = _color_of(sources.denoised, (height, width))
+    if sources.denoised_full:
+        pairs["denoised_full"] = _color_of(sources.denoised_full, (height, width))
     return Loaded(Frame(**pairs), Origin(sources.a, taken, stamp))
 
 

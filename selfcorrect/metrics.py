@@ -353,7 +353,7 @@ def _resampled_means(errors: Tensor, seed: int | torch.Generator) -> Tensor:
     generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
     planes = torch.cat([errors, torch.ones_like(errors[:1])])
     pooled = functional.avg_pool2d(planes, TILE, ceil_mode=True, divisor_override=1)
-    # NumPy has no threads here, whose thousand tiny meetings stall where other programs hold the cores.
+    # NumPy starts no threads here: a thousand small barriers would stall where other programs hold the cores.
     tiles = pooled.flatten(1).numpy()  # (K + 1, T): the sums over each tile, the last its pixels
     count = tiles.shape[1]
     if count == 1:

@@ -123,12 +123,12 @@ class Settings:
         f"{_PAPER}, Sec. 4",
         choices=("halves", "full"),
     )
-    guard: bool = _setting(False, "blend with the denoised image as far as the halves bear it out", _OURS)
+    guard: bool = _setting(False, "blend with the denoised image as far as the halves confirm it", _OURS)
     crossed_weights: bool = _setting(
         False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
     time_budget: float = _setting(
-        0.0, "seconds for the whole frame: training takes what else needs not; 0 sets none", "the user's", unit="s"
+        0.0, "seconds for the whole frame: training takes what the rest leaves; 0 sets none", "the user's", unit="s"
     )
     seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
 
@@ -160,7 +160,7 @@ class Settings:
         """Every preset by its name; the first is the default.
 
         ``paper`` is Back et al. 2022 as published. The others are points of the trade of speed for accuracy that
-        `scripts/bench/tradeoff.py` measures: README has its table.
+        `scripts/bench/tradeoff.py` measures; `scripts/bench/RESULTS.md` has its table.
         """
         balanced = cls(
             patch=64,

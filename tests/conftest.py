@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-import subprocess
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+import variants
 from helpers.commands import write_half
 from helpers.shots import Run, write_shot
 
@@ -21,12 +22,6 @@ HAS_BLENDER = sys.version_info[:2] == (3, 11) and platform.machine() != "aarch64
 
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(mode=True)
-
-
-def has_llvm() -> bool:
-    """Whether Mitsuba finds an LLVM library that it can work with; no package installs one."""
-    probe = 'import mitsuba as mi; mi.set_variant("llvm_ad_rgb"); assert (mi.Float([1, 2]) + 1)[1] == 3'
-    return subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode == 0
 
 
 def shared_folder() -> Path:
@@ -74,12 +69,51 @@ def shared() -> Path:
     return shared_folder()
 
 
+LACKED = ("shared", "blender", "browser", "llvm")
+LEFT_OUT = pytest.StashKey[dict[str, list[str]]]()
+"""Of each need that this machine lacks, the names of the tests left out for it."""
+
+
+def needs(item: pytest.Item) -> list[str]:
+    """What a test is marked to need, of what a machine may lack."""
+    return [need for need in LACKED if item.get_closest_marker(need)]
+
+
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests of what this machine cannot have: the development frames, Blender, LLVM; and no others."""
+    """Leave out the tests of what this machine cannot have: the development frames, Blender, a browser, LLVM; and no others."""
     there = {"shared": shared_folder().is_dir(), "blender": HAS_BLENDER}
-    there["llvm"] = any(item.get_closest_marker("llvm") for item in items) and has_llvm()
-    if os.environ.get("SELFCORRECT_REQUIRE_SHARED") and not any(item.get_closest_marker("shared") for item in items):
+    there["browser"] = all(shutil.which(program) for program in ("chromium", "chromedriver"))
+    there["llvm"] = any("llvm" in needs(item) for item in items) and variants.failure() is None
+    left_out: dict[str, list[str]] = {}
+    lacking = []
+    for item in items:
+        missing = [need for need in needs(item) if not there[need]]
+        lacking += [item] if missing else []
+        for need in missing:
+            left_out.setdefault(need, []).append(item.name.partition("[")[0])
+    config.stash[LEFT_OUT] = left_out
+    if lacking:
+        config.hook.pytest_deselected(items=lacking)
+        items[:] = [item for item in items if item not in lacking]
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    """Where the development frames are required, no test of them may be left out, by whatever means."""
+    if os.environ.get("SELFCORRECT_REQUIRE_SHARED") and any("shared" in needs(item) for item in items):
+        raise pytest.UsageError("expected every test that needs the development frames to run, but some were left out")
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Where the development frames are required, there must be tests of them."""
+    if os.environ.get("SELFCORRECT_REQUIRE_SHARED") and not any("shared" in needs(item) for item in session.items):
         raise pytest.UsageError("expected tests that need the development frames, but got none")
-    lacking = [item for item in items if any(item.get_closest_marker(need) and not there[need] for need in there)]
-    config.hook.pytest_deselected(items=lacking)
-    items[:] = [item for item in items if item not in lacking]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """One line for each thing that this machine lacks: the tests left out for it, by name."""
+    reasons = {"shared": "no development frames", "blender": "no package bpy for this Python"}
+    reasons["browser"] = "no chromium and chromedriver on the PATH"
+    for need, names in config.stash.get(LEFT_OUT, {}).items():
+        why = reasons.get(need) or variants.refusal("Mitsuba")
+        terminalreporter.write_line(f"left out: {', '.join(dict.fromkeys(names))}: {why}")

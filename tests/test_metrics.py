@@ -1,4 +1,4 @@
-"""relMSE and its kin against plain NumPy or a closed form; standard errors against the spread they claim to know."""
+"""relMSE and other metrics against plain NumPy or a closed form; standard errors against the spread they predict."""
 
 import dataclasses
 import itertools

@@ -54,10 +54,20 @@ class TestPoints:
             assert set(changed) <= set(named)
             assert tradeoff.point(one.name, TINY) == one
 
-    def test_every_knob_is_varied(self) -> None:
+    def test_every_setting_is_varied(self) -> None:
         names = " ".join(p.name for p in tradeoff.points(TINY))
-        for knob in ("steps", "patch", "batch", "window", "taps_every", "filters", "layers", "precision", "schedule"):
-            assert f"{knob}=" in names
+        for setting in (
+            "steps",
+            "patch",
+            "batch",
+            "window",
+            "taps_every",
+            "filters",
+            "layers",
+            "precision",
+            "schedule",
+        ):
+            assert f"{setting}=" in names
         assert "learning_rate=" in names
 
     def test_a_base_that_is_a_preset_is_not_tried_twice(self) -> None:

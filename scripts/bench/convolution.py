@@ -17,7 +17,7 @@ from kernel import processor
 from torch import Tensor
 
 from selfcorrect import Settings
-from selfcorrect.kernel import convolution
+from selfcorrect.kernel.convolution import cpu, reference
 from selfcorrect.stages.core.network import Network
 
 INPUTS, HEADS, PATCHES = 13, 15, 8
@@ -35,12 +35,12 @@ def best(function: Callable[[], object], repeat: int, clock: Callable[[], float]
 
 def peak(isa: str) -> float:
     """Multiply-adds per second."""
-    count = convolution.peak(isa, 100_000)
-    return count / best(lambda: convolution.peak(isa, 100_000), 20, time.process_time)
+    count = cpu.peak(isa, 100_000)
+    return count / best(lambda: cpu.peak(isa, 100_000), 20, time.process_time)
 
 
 def multiply_adds(network: Network, *, backward: bool) -> int:
-    """Per pixel; the way back takes as many for the weights, and for the inputs except the first layer's."""
+    """Per pixel; the backward pass takes as many for the weights, and for the inputs except the first layer's."""
     layers = [parameter.numel() for parameter in network.parameters() if parameter.ndim == 4]
     return 3 * sum(layers) - layers[0] if backward else sum(layers)
 
@@ -57,14 +57,14 @@ def main() -> None:
     upstream = torch.rand(PATCHES, HEADS, options.patch, options.patch, generator=generator)
 
     def in_torch(images: Sequence[Tensor]) -> Tensor:
-        return network.reference(torch.stack(list(images)))
+        return reference.convolutions(images, parameters)
 
     def in_torch_bf16(images: Sequence[Tensor]) -> Tensor:
         with torch.autocast("cpu", torch.bfloat16):
             return in_torch(images).float()
 
     def compiled(isa: str, threads: int) -> Callable[[Sequence[Tensor]], Tensor]:
-        return lambda images: convolution.convolutions(images, parameters, isa=isa, threads=threads)
+        return lambda images: cpu.convolutions(images, parameters, isa=isa, threads=threads)
 
     print(f"{processor()}; torch {torch.__version__}; {PATCHES} patches of {options.patch}x{options.patch}")
     print("ns per pixel and half (best of runs)          forward   with backward   over torch   share of peak")
@@ -72,7 +72,7 @@ def main() -> None:
         torch.set_num_threads(threads)
         clock = time.process_time if threads == 1 else time.perf_counter
         forms = {"torch fp32": in_torch, "torch bf16": in_torch_bf16}
-        forms |= {isa: compiled(isa, threads) for isa in convolution.instruction_sets()}
+        forms |= {isa: compiled(isa, threads) for isa in cpu.instruction_sets()}
         baseline = 0.0
         for name, form in forms.items():
 
@@ -87,7 +87,7 @@ def main() -> None:
             one, two = (best(f, options.repeat, clock) / pixels * 1e9 for f in (forward, both))
             baseline = baseline or two
             share = ""
-            if threads == 1 and name in convolution.instruction_sets():
+            if threads == 1 and name in cpu.instruction_sets():
                 speeds = (multiply_adds(network, backward=b) / ns * 1e9 for b, ns in ((False, one), (True, two)))
                 most = peak(name)
                 share = " / ".join(f"{speed / most:.0%}" for speed in speeds) + f" of {most / 1e9:.0f} G/s"

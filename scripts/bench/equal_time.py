@@ -10,8 +10,8 @@ of relMSE and spp between the measured numbers of samples (beyond the last one o
 The ratio of corrected to denoised-with-more-samples is below 1 where correcting wins. At the end, for each frame and
 point, the spp from which it stays so.
 
-Seconds are those of the processor, all threads together, as the renderer's are (seconds of one core, from the README
-of the frames): they do not grow where other processes use the machine. --cost overrides the renderer's.
+Seconds are CPU seconds, all threads together, as the renderer's are (seconds of one core, from the README of the
+frames): they do not grow where other processes use the machine. --cost overrides the renderer's.
 """
 
 import argparse
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--frames", nargs="*", help="names; by default all in the folder")
     parser.add_argument("--spp", type=int, nargs="*", default=[16, 64, 256], help="two or more, increasing")
     quick = [name for name in Settings.presets() if name in ("fast", "balanced")]
-    parser.add_argument("--points", nargs="*", default=quick, help="presets, or settings as bench_tradeoff.py has them")
+    parser.add_argument("--points", nargs="*", default=quick, help="presets, or settings as tradeoff.py has them")
     parser.add_argument("--denoiser", default="oidn")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--cost", nargs="*", default=[], metavar="FRAME=SECONDS", help="of one sample per pixel")

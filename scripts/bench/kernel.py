@@ -13,16 +13,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from selfcorrect import Frame, Settings, correct
-from selfcorrect.kernel.cross_bilateral import cpu, heads_count, reference
+from selfcorrect.buffers import TERMS
+from selfcorrect.kernel.backend import instruction_sets
+from selfcorrect.kernel.cross_bilateral import Window, cpu, heads_count, reference
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.stages.core.loss import dual_buffer_loss
 from selfcorrect.stages.core.network import Network
 
-WINDOW = 19
+WINDOW = Window(19)
 PATCH = 128  # the paper's
+ALL = tuple(term.name for term in TERMS)
 
 
 def processor() -> str:
@@ -42,27 +44,24 @@ def best(function: Callable[[], None], repeat: int) -> float:
     return min(times)
 
 
-BUFFERS = {
-    "color": (),
-    "color, albedo, normal": ("albedo", "normal"),
-    "color, albedo, normal, visibility": ("albedo", "normal", "visibility"),
+SETS = {
+    "color": ("color", "denoised"),
+    "color, albedo, normal": ("color", "denoised", "albedo", "normal"),
+    "color, albedo, normal, visibility": ALL,
 }
 
 
-def make_guides(size: int, buffers: tuple[str, ...] = ("albedo", "normal", "visibility")) -> Guides:
+def make_guides(size: int, buffers: tuple[str, ...]) -> Guides:
     generator = torch.Generator().manual_seed(0)
-
-    def buffer(channels: int) -> Tensor:
-        return torch.rand(size, size, channels, generator=generator)
-
-    features = {name: buffer(1 if name == "visibility" else 3) for name in buffers}
-    return Guides.of_half(buffer(3), buffer(3), margin=WINDOW // 2, **features)
+    there = [term for term in TERMS if term.name in buffers]
+    half = {term.name: torch.rand(size, size, term.channels, generator=generator) for term in there}
+    return Guides.of_half(half, margin=WINDOW.radius)
 
 
-def nanoseconds(form: str, size: int, threads: int, repeat: int, buffers: tuple[str, ...] | None = None) -> float:
+def nanoseconds(form: str, size: int, threads: int, repeat: int, buffers: tuple[str, ...] = ALL) -> float:
     """Forward and backward of Eq. 10 and Eq. 8's half on one image of size² pixels."""
     torch.set_num_threads(threads)
-    guides = make_guides(size) if buffers is None else make_guides(size, buffers)
+    guides = make_guides(size, buffers)
     raw = 0.3 * torch.randn(1, heads_count(guides, "eq10"), size, size, generator=torch.Generator().manual_seed(1))
     raw = raw.to(memory_format=torch.channels_last).requires_grad_()
     corners = torch.zeros(1, 2, dtype=torch.int64)
@@ -72,25 +71,14 @@ def nanoseconds(form: str, size: int, threads: int, repeat: int, buffers: tuple[
     def run() -> None:
         if form in ("unfold", "shift"):
             taps = None if form == "unfold" else 1
-            g = reference.cross_bilateral(guides, raw, corners, window=WINDOW, taps_per_step=taps)
+            g = reference.cross_bilateral(guides, raw, corners, WINDOW, taps_per_step=taps)
             loss = 0.5 * (g - cut).square().mean()
         else:
-            loss = cpu.cross_bilateral_loss(
-                guides,
-                raw,
-                corners,
-                target,
-                weight,
-                window=WINDOW,
-                every=1,
-                combination="eq10",
-                threads=threads,
-                isa=form,
-            )
+            loss = cpu.cross_bilateral_loss(guides, raw, corners, target, weight, WINDOW, threads=threads, isa=form)
         raw.grad = None
         loss.backward()
 
-    return best(run, repeat) / (size * size * WINDOW * WINDOW) * 1e9
+    return best(run, repeat) / (size * size * WINDOW.side**2) * 1e9
 
 
 def split_run(size: int) -> None:
@@ -105,10 +93,7 @@ def split_run(size: int) -> None:
     result = correct(frame, settings)
     total = time.perf_counter() - start
 
-    guides = tuple(
-        Guides.of_half(h.color, h.denoised, margin=73, albedo=h.albedo, normal=h.normal, visibility=h.visibility)
-        for h in frame.halves
-    )
+    guides = tuple(Guides.of_half(half._asdict(), margin=73) for half in frame.halves)
     weights = tuple(torch.ones_like(half.planes[0]) for half in guides)
     corners = torch.randint(0, size - 128, (settings.batch, 2), generator=generator)
     batch = torch.cat([half.patches(corners, (128, 128)) for half in guides])
@@ -134,18 +119,18 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--no-run", action="store_true", help="leave out the 512x512 run")
     options = parser.parse_args()
-    print(f"{processor()}; torch {torch.__version__}; window {WINDOW}, all 13 channels")
+    print(f"{processor()}; torch {torch.__version__}; window {WINDOW.side}, all 13 channels")
     print("ns per pixel, tap and buffer, forward + backward (best of runs)")
     for threads in (1, 2):
         unfold = nanoseconds("unfold", PATCH, threads, 2)
         shift = nanoseconds("shift", PATCH, threads, 2)
         print(f"{threads} thread(s)  reference: unfold {unfold:.1f}, shift loop {shift:.1f}")
-        for isa in cpu.instruction_sets():
+        for isa in instruction_sets():
             value = nanoseconds(isa, PATCH, threads, options.repeat)
             print(f"  {isa:9} {value:6.2f}   {unfold / value:6.0f}x unfold  {shift / value:5.0f}x shift loop")
-    for name, buffers in BUFFERS.items():
-        value = nanoseconds(cpu.instruction_sets()[-1], PATCH, 1, options.repeat, buffers)
-        print(f"{cpu.instruction_sets()[-1]}, 1 thread, {name}: {value:.2f}")
+    for name, buffers in SETS.items():
+        value = nanoseconds(instruction_sets()[-1], PATCH, 1, options.repeat, buffers)
+        print(f"{instruction_sets()[-1]}, 1 thread, {name}: {value:.2f}")
     if not options.no_run:
         torch.set_num_threads(2)
         split_run(512)

@@ -1,4 +1,4 @@
-"""How often training may see a pixel before it learns the noise by heart: small pieces of frames, several bounds.
+"""How often training may see a pixel before it overfits the noise: small pieces of frames, several bounds.
 
     .venv/bin/python scripts/bench/small_frames.py ../shared/frames [--side 128] [--spp 16 64] [--visits 32 64 128 0]
 

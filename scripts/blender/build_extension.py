@@ -6,7 +6,7 @@ The zip is what Blender 4.2 and later install: Preferences â†’ Get Extensions â†
 Python; the same files give the same bytes.
 """
 
-import sys
+import argparse
 import tomllib
 import zipfile
 from pathlib import Path
@@ -29,5 +29,13 @@ def build(folder: Path) -> Path:
     return target
 
 
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "folder", metavar="DIR", type=Path, nargs="?", default=Path(), help="for the zip; by default here"
+    )
+    print(build(parser.parse_args().folder))
+
+
 if __name__ == "__main__":
-    print(build(Path(sys.argv[1] if len(sys.argv) > 1 else ".")))
+    main()

@@ -1,4 +1,4 @@
-"""Build the small Blender scene of the README's shot: a textured room corner and a moving camera, 24 frames.
+"""Build the small Blender scene of scripts/openjd/README.md: a textured room corner and a moving camera, 24 frames.
 
     python scripts/blender/build_shot.py shot.blend
 
@@ -8,6 +8,7 @@ Noisy because of a small lamp behind a lattice and glossy spheres, detailed beca
 pixels, 32 samples.
 """
 
+import argparse
 import math
 import sys
 from pathlib import Path
@@ -96,7 +97,10 @@ def camera(scene: Any) -> None:
 
 
 def main() -> None:
-    path = Path((sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:])[0]).resolve()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", metavar="FILE", type=Path, help="the scene to write, such as shot.blend")
+    own = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    path = parser.parse_args(own).file.resolve()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"

@@ -61,7 +61,7 @@ IMAGE = {
 
 
 class RenderError(Exception):
-    """A scene that the user can mend; one line."""
+    """A scene that the user can fix; one line."""
 
 
 def _set(target: object, values: dict[str, object]) -> None:
@@ -132,7 +132,7 @@ def _scene(name: str | None) -> bpy.types.Scene:
 
 @bpy.app.handlers.persistent  # stays when the file is opened
 def _print_samples(stats: str, *_: object) -> None:
-    """Progress for who reads the output: "Sample 3/16"."""
+    """Progress for whoever reads the output: "Sample 3/16"."""
     if "Sample" in stats:
         print(stats, flush=True)
 

@@ -15,7 +15,8 @@ uses ``$frame`` gets the frame number without being asked.
 differences of such a render: what `selfcorrect combine` takes as correlated images.
 
 Needs the extra `render`; the LLVM variants also need the LLVM shared library (`apt-get install libllvm19`, and the
-variable DRJIT_LIBLLVM_PATH where it is not found), and without it `--variant scalar_rgb` does the same, more slowly.
+variable DRJIT_LIBLLVM_PATH where it is not found). Without one that renders, `scalar_rgb` does the same, more slowly,
+but for common random numbers.
 """
 
 import argparse
@@ -33,6 +34,7 @@ import mitsuba as mi
 import numpy as np
 from halves import HALVES, add_arguments, path_of, published, seed_of
 from screened_poisson import screened_poisson
+from variants import LLVM, SCALAR, VariantError, chosen
 
 CRN = "common_random_numbers"  # the sampler, and the script that has it
 AOVS = "albedo:albedo,nn:sh_normal,dd:depth"
@@ -53,7 +55,7 @@ _FUNCTIONS = {name: getattr(math, name) for name in ("sin", "cos", "tan", "sqrt"
 
 
 class RenderError(Exception):
-    """A scene or a flag that the user can mend; one line."""
+    """A scene or a flag that the user can fix; one line."""
 
 
 def evaluate(expression: str, frame: int) -> float:
@@ -177,7 +179,7 @@ def arguments() -> argparse.Namespace:
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--crn", action="store_true", help="common random numbers: the same sequence in every pixel")
     kind.add_argument("--poisson", action="store_true", help="screened Poisson of independent samples and of --crn's")
-    parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba (default: %(default)s)")
+    parser.add_argument("--variant", help=f"of Mitsuba (default: {LLVM}, or {SCALAR} where LLVM does not render)")
     return parser.parse_args()
 
 
@@ -210,23 +212,19 @@ def _reconstruct(bitmap: Any, common: Any) -> None:
 
 def main() -> int:
     options = arguments()
-    if options.variant not in mi.variants():
+    crn = options.crn or options.poisson
+    if options.variant not in (None, *mi.variants()):
         print(
             f"render_mitsuba: error: expected a variant of {mi.variants()}, but got {options.variant!r}",
             file=sys.stderr,
         )
         return 2
     try:
-        mi.set_variant(options.variant)
-        if options.crn or options.poisson:
-            if not options.variant.startswith("llvm"):
-                raise RenderError(f"expected an LLVM variant with common random numbers, but got {options.variant}")
+        mi.set_variant(chosen(options.variant, sampler=crn))
+        if crn:
             importlib.import_module(CRN)  # registers the sampler in the LLVM variant
         render_shot(options)
-    except ImportError as error:  # of the LLVM library
-        print(f"render_mitsuba: error: {error}; or take --variant scalar_rgb", file=sys.stderr)
-        return 2
-    except (RenderError, OSError) as error:
+    except (RenderError, VariantError, ImportError, OSError) as error:  # ImportError: of CUDA's library
         print(f"render_mitsuba: error: {error}", file=sys.stderr)
         return 2
     return 0

@@ -1,7 +1,8 @@
 """Render the frame that is packaged with selfcorrect, from the scene in `scene.py`.
 
 Run it with the extra `render`, which brings Mitsuba 3 and Open Image Denoise; Mitsuba's LLVM backend also needs the
-LLVM shared library (`apt-get install libllvm19`; the variable DRJIT_LIBLLVM_PATH names it where it is not found)::
+LLVM shared library (`apt-get install libllvm19`; the variable DRJIT_LIBLLVM_PATH names it where it is not found).
+Without one that renders, `scalar_rgb` does it more slowly, from other samples::
 
     pip install -e '.[render]'
     python scripts/render/render_packaged_frame.py  # as shipped, about eight minutes on two cores
@@ -21,6 +22,7 @@ arguments give the same files on the same machine; the scene itself does not dep
 import argparse
 import itertools
 import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,8 +34,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 from scene import still_life
-
-mi.set_variant("llvm_ad_rgb")
+from variants import LLVM, SCALAR, VariantError, chosen
 
 SHIPPED = Path(__file__).resolve().parents[2] / "selfcorrect" / "data"
 SIZE = 260  # just over 4 × 64: 25 patches of the paper's grid and two optimiser steps per epoch, where 256 has one
@@ -68,6 +69,11 @@ def arguments() -> argparse.Namespace:
         "--ref-spp", type=positive, default=1024, help="samples of each reference (default: %(default)s)"
     )
     parser.add_argument("--seed", type=positive, default=1, help="of the first pass; the rest count up (default: 1)")
+    parser.add_argument(
+        "--variant",
+        choices=(LLVM, SCALAR),
+        help=f"of Mitsuba (default: {LLVM}, or {SCALAR} where LLVM does not render)",
+    )
     options = parser.parse_args()
     if options.spp % 2:
         parser.error(f"argument --spp: expected an even number, to halve it, but got {options.spp}")
@@ -109,14 +115,20 @@ def smooth(references: Image, halves: Image) -> Image:
     return np.asarray(mitsuba_oidn.denoise(colour, albedo=albedo, normal=normal, hdr=True), dtype=np.float64)
 
 
-def main() -> None:
+def main() -> int:
     """Render halves and references, denoise the mean of the references, write all."""
     options = arguments()
+    try:
+        variant = chosen(options.variant)
+    except VariantError as error:
+        print(f"render_packaged_frame: error: {error}", file=sys.stderr)
+        return 2
+    mi.set_variant(variant)
     options.out.mkdir(parents=True, exist_ok=True)
     scene = mi.load_dict(still_life(options.size) | {"integrator": GBUFFERS})
     beauty = mi.load_dict(PATH)
     seeds = itertools.count(options.seed)
-    renderer = f"Mitsuba {mi.__version__}, llvm_ad_rgb, path, depth {PATH['max_depth']}"
+    renderer = f"Mitsuba {mi.__version__}, {variant}, path, depth {PATH['max_depth']}"
 
     def save(stem: str, integrator: Any, spp: int, names: tuple[str, ...]) -> Image:
         first = next(seeds)
@@ -131,7 +143,8 @@ def main() -> None:
     origin = f"{renderer}; mean of demo_ref_A and _B, Open Image Denoise"
     attributes: dict[str, int | str] = {"samplesPerPixel": 2 * options.ref_spp, "renderer": origin}
     write(options.out / "demo_ref_smooth.exr", denoised, COLOUR, attributes)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

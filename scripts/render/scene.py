@@ -85,10 +85,14 @@ def grid_mesh(name: str, points: Array, bsdf: Dict, keep: NDArray[np.bool_] | No
         name, rows * columns, len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties
     )
     buffers = mi.traverse(mesh)
-    buffers["vertex_positions"] = mi.Float(points.ravel())
-    buffers["vertex_normals"] = mi.Float(normals.ravel())
-    buffers["vertex_texcoords"] = mi.Float(np.stack([u, v], -1).ravel())
-    buffers["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+    filled = {
+        "vertex_positions": points,
+        "vertex_normals": normals,
+        "vertex_texcoords": np.stack([u, v], -1),
+        "faces": faces.astype(np.uint32),
+    }
+    for buffer, values in filled.items():
+        buffers[buffer] = type(buffers[buffer])(values.ravel())  # mi.Float of a scalar variant is one number
     buffers.update()
     return mesh
 

@@ -7,7 +7,7 @@ blend scales; Balint et al. 2023 let the network weigh the pixels of the pyramid
 - demodulated: radiance over a texture that the network sets for each pixel, between 1 and the albedo, so that texture
   survives a wide filter where the albedo explains it and does no harm where it doesn't (mirrors, glass);
 - homogeneous: (w · radiance, w) with a weight w in (0, 1) that the network gives each pixel. Kernels, averages and
-  blends work on all four channels alike and one division ends it: an outlier is turned down once, on all scales, and
+  blends work on all four channels alike and one division ends it: an outlier is down-weighted once, on all scales, and
   pixels beyond the border, all zeros, do not count.
 
 The result is a weighted mean of the frame's demodulated radiances, and no brighter than the brightest pixel near by:

@@ -10,7 +10,8 @@ shows depends on the seed and its number alone: an interrupted run goes on where
 `validation/` has views with two clean references each: from cameras that no training view comes near, in scenes with
 their own materials, and in rooms that no training view shows. The scenes' own cameras are kept out of both.
 
-Needs the extra `render` and the LLVM shared library, see `render_mitsuba.py`.
+Needs the extra `render` and an LLVM library that renders, see `render_mitsuba.py`. Without one, `scalar_rgb` renders
+more slowly, and views that would have had common random numbers are denoised by `joint-bilateral` instead.
 """
 
 import argparse
@@ -36,11 +37,10 @@ from dataset import View, inputs_of, metadata_of, save, views
 from render_mitsuba import CRN, load_scene
 from rooms import room
 from scene import still_life
+from variants import LLVM, SCALAR, VariantError, chosen
 from variation import Camera, Variation, original_camera, random_camera, sensor
 
 import denoisers
-
-importlib.import_module(CRN)  # sets the LLVM variant, and registers the sampler in it
 
 SIZE = 128
 SPP = (8, 16, 24, 32, 48, 64, 96, 128)  # of a frame
@@ -66,6 +66,7 @@ class Job(NamedTuple):
     seed: int
     reference_spp: int
     size: int
+    variant: str  # of Mitsuba
 
 
 class Shot(NamedTuple):
@@ -186,6 +187,8 @@ def training_view(job: Job, name: str, number: int) -> tuple[View, dict[str, str
     camera = _chosen_camera(job, place, reserved, rng)
     spp = int(rng.choice(SPP))
     extra = str(rng.choice(list(EXTRA), p=list(EXTRA.values())))
+    if extra == CRN and job.variant != LLVM:
+        extra = "joint-bilateral"
     return _view(job, place, Shot(number, name, camera, spp, extra), rng)
 
 
@@ -214,7 +217,12 @@ def _view(job: Job, place: Loaded, shot: Shot, rng: np.random.Generator) -> tupl
     else:
         denoised[shot.denoiser] = _denoised(shot.denoiser, noisy, albedo, normal, depth)
     view = View(f"{shot.number:07d}", shot.scene, shot.spp, color, albedo, normal, depth, denoised)
-    facts = {"seed": job.seed, "number": shot.number, "camera": shot.camera, "renderer": f"Mitsuba {mi.__version__}"}
+    facts = {
+        "seed": job.seed,
+        "number": shot.number,
+        "camera": shot.camera,
+        "renderer": f"Mitsuba {mi.__version__}, {job.variant}",
+    }
     return view, {name: str(value) for name, value in facts.items()}
 
 
@@ -251,6 +259,9 @@ def _made(job: Job, part: str, name: str, numbers: list[int]) -> int:
     """Make the files of some views of one scene; runs in a process of its own, and says how many."""
     torch.set_num_threads(1)
     drjit.set_thread_count(1)
+    mi.set_variant(job.variant)
+    if job.variant == LLVM:
+        importlib.import_module(CRN)  # registers the sampler
     for number in numbers:
         started = time.perf_counter()
         view, facts = (validation_view if part == VALIDATION else training_view)(job, name, number)
@@ -281,13 +292,23 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--size", type=int, default=SIZE, help="pixels (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes (default: one per core)")
+    parser.add_argument(
+        "--variant",
+        choices=(LLVM, SCALAR),
+        help=f"of Mitsuba (default: {LLVM}, or {SCALAR} where LLVM does not render)",
+    )
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no view after that")
     return parser.parse_args()
 
 
 def main() -> int:
     options = arguments()
-    job = Job(options.scenes.resolve(), options.output, options.seed, options.reference_spp, options.size)
+    try:
+        variant = chosen(options.variant)
+    except VariantError as error:
+        print(f"render_dataset: error: {error}", file=sys.stderr)
+        return 2
+    job = Job(options.scenes.resolve(), options.output, options.seed, options.reference_spp, options.size, variant)
     all_validation = VALIDATION_VIEWS * len(validation_names(job.scenes))
     validation = all_validation if options.validation is None else min(all_validation, options.validation)
     wanted = {VALIDATION: validation, "train": options.views}

@@ -1,6 +1,6 @@
 """Procedural rooms, so that five scenes don't become the world: a seed gives a room as a Mitsuba dictionary.
 
-z points up. `mitsuba.set_variant` must have been called before this is imported.
+z points up. `mitsuba.set_variant` must have been called before :func:`room`.
 """
 
 from collections.abc import Callable

@@ -175,7 +175,7 @@ def _importance(sample: Sample) -> Tensor:
     """About 1 / the relative squared noise of the inputs.
 
     Unweighted, the few noisiest views would decide everything. It is made of inputs alone, so that what is learned at a
-    pixel is still the mean of all targets. Outliers are bounded here: a single one should not silence a view.
+    pixel is still the mean of all targets. Outliers are bounded here: a single one should not remove a view.
     """
     squared = ((sample.noisy.mean(0) - sample.level) ** 2).mean(0) / (sample.level.mean(0) ** 2 + 0.01)
     return 1 / (squared.clamp(max=10).mean() + 0.01)

@@ -148,7 +148,7 @@ class JamesSteinTask:
 
     The biased images are what the stage may get: regressions as the paper's (four times of ten); the denoised inputs,
     moved so that their mean is the denoised mean (three); one and the same denoised image twice, as where a half is
-    shrunk (two); and the inputs under a box filter (one): bad ones are to be known, too.
+    shrunk (two); and the inputs under a box filter (one): it has to meet bad ones, too.
     """
 
     baseline = "classical James–Stein"

@@ -1,6 +1,6 @@
 """Random cameras, materials and lights in a loaded Mitsuba scene. Everything is drawn from a generator passed in.
 
-`mitsuba.set_variant` must have been called with an LLVM variant before this is imported.
+`mitsuba.set_variant` must have been called before anything of it is.
 """
 
 import math
@@ -210,7 +210,11 @@ def _directions(up: Vector, rng: Rng) -> Vector:
 
 def _distances(scene: Any, origin: Vector, directions: Vector) -> Vector:
     """How far rays go, infinite where they hit nothing."""
-    at, to = (mi.Point3f(*_triple(origin)), mi.Vector3f(np.ascontiguousarray(directions.T.astype(np.float32))))
+    at = mi.Point3f(*_triple(origin))
+    if not dr.is_array_v(mi.Float):  # a scalar variant, one ray at a time
+        hits = [scene.ray_intersect_preliminary(mi.Ray3f(at, mi.Vector3f(*_triple(to)))) for to in directions]
+        return np.array([hit.t if hit.is_valid() else math.inf for hit in hits], dtype=float)
+    to = mi.Vector3f(np.ascontiguousarray(directions.T.astype(np.float32)))
     hit = scene.ray_intersect_preliminary(mi.Ray3f(at, to))
     return np.array(dr.select(hit.is_valid(), hit.t, math.inf), dtype=float)
 

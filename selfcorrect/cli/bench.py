@@ -4,10 +4,13 @@ import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from selfcorrect import exr, files, tradeoff
-from selfcorrect.cli.runner import Runner, add_halves, add_run_flags, answer, log, mapping
+from selfcorrect import exr, files, report, tradeoff
+from selfcorrect.cli import flags, pages
+from selfcorrect.cli.runner import Runner
+from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import publish
@@ -22,7 +25,7 @@ _ERROR = "estimated relMSE over that of the denoised image"
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("bench", help="what each second buys on this frame, and the preset to take")
-    add_halves(parser)
+    flags.add_halves(parser)
     parser.add_argument(
         "--points",
         nargs="+",
@@ -35,7 +38,8 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--csv", metavar="OUT.csv", help="keep the measurements here, after each point")
     parser.add_argument("--plot", metavar="OUT.png", help="seconds against error (needs the extra bench)")
-    add_run_flags(parser)
+    pages.add_flag(parser)
+    flags.add_run_flags(parser)
     parser.set_defaults(run=_bench)
 
 
@@ -49,6 +53,7 @@ def _bench(options: argparse.Namespace) -> None:
         None if path is None else exr.check_target(path, suffix)
         for path, suffix in ((options.csv, ".csv"), (options.plot, ".png"))
     )
+    page = pages.target(options.report)
     if picture is not None:
         tradeoff.figure_class()  # what is missing is to be known before the work
     points = _points(options, replace(runner.settings, guard=True))
@@ -63,7 +68,11 @@ def _bench(options: argparse.Namespace) -> None:
                 publish(table, tradeoff.table(measured))
     finally:  # also after Ctrl-C: what was measured is worth its minutes
         if measured:
-            _answer(options, frame, measured)
+            found = _found(frame, measured)
+            _answer(options, found, measured)
+            if page is not None:
+                facts = {"title": Path(options.a).name, "size": found["size"], "denoiser": runner.denoiser}
+                pages.write(page, report.bench_page(found["points"], found["front"], found["recommended"], facts))
     if picture is not None:
         publish(picture, tradeoff.plot(measured, _ERROR, title=f"{frame.size[1]}x{frame.size[0]} pixels"))
 
@@ -79,13 +88,12 @@ def _points(options: argparse.Namespace, base: Settings) -> list[Point]:
 
 def _frame(options: argparse.Namespace, runner: Runner, halves: Sequence[str], *, given: bool) -> Frame:
     """A frame with its denoised halves; ``given``: those of the flags, where there are any."""
-    names = ("denoised_a", "denoised_b", "denoised") if given else ()
-    denoised = {name: getattr(options, name) for name in names}
+    denoised = flags.denoised(options) if given else {}
     start = time.perf_counter()
-    loaded = files.load(files.Sources(halves[0], halves[1], **denoised, mapping=mapping(options)))
-    frame, denoiser = runner.prepare(loaded, {})
-    log(f"read and denoised ({denoiser}) in {time.perf_counter() - start:.1f} s")
-    return frame.to(options.device)
+    loaded = files.load(files.Sources(halves[0], halves[1], **denoised, mapping=flags.mapping(options)))
+    prepared = runner.prepare(loaded, start)
+    log(f"read and denoised ({prepared.facts.denoiser}) in {time.perf_counter() - start:.1f} s")
+    return prepared.frame.to(options.device)
 
 
 def _told(m: Measurement) -> str:
@@ -93,20 +101,24 @@ def _told(m: Measurement) -> str:
     return f"{m.point.name}: {m.ratio:.3f} ± {m.standard_error:.3f} in {m.seconds:.2f} s{cold}"
 
 
-def _answer(options: argparse.Namespace, frame: Frame, measured: list[Measurement]) -> None:
+def _found(frame: Frame, measured: list[Measurement]) -> dict[str, Any]:
+    """What --json prints."""
+    height, width = frame.size
+    chosen = tradeoff.recommended(measured)
+    return {
+        "size": {"width": width, "height": height},
+        "points": [_plain(m) for m in measured],
+        "front": [m.point.name for m in tradeoff.pareto_front(measured)],
+        "recommended": None if chosen is None else chosen.point.name,
+    }
+
+
+def _answer(options: argparse.Namespace, found: dict[str, Any], measured: list[Measurement]) -> None:
     """The table and the recommendation, on stdout."""
-    front, chosen = tradeoff.pareto_front(measured), tradeoff.recommended(measured)
     if options.json:
-        height, width = frame.size
-        answer(
-            {
-                "size": {"width": width, "height": height},
-                "points": [_plain(m) for m in measured],
-                "front": [m.point.name for m in front],
-                "recommended": None if chosen is None else chosen.point.name,
-            }
-        )
+        answer(found)
         return
+    front, chosen = tradeoff.pareto_front(measured), tradeoff.recommended(measured)
     print(f"{'point':24} {'train':>8} {'infer':>8} {'seconds':>8}  {_ERROR}; * on the Pareto front")
     for m in measured:
         mark = " *" if m in front else ""

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import torch
 
+from denoisers.host import FEATURES as DENOISER_FEATURES
+from selfcorrect.buffers import FEATURES, INPUTS
 from selfcorrect.errors import SettingsError
 from selfcorrect.exr import channels
 from selfcorrect.exr.file import headers
@@ -50,14 +52,20 @@ def parse_size(text: str) -> int:
     return int(float(found[1]) * _UNITS[found[2].upper()])
 
 
-def scratch_within(limit: int, sources: Sources, settings: Settings) -> int:
+def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: int = 0) -> int:
     """Bytes that are left for OIDN beside its images.
+
+    Args:
+        limit: bytes to stay within.
+        sources: the frame's files.
+        settings: of the correction.
+        extra: how many images stages need beyond the halves.
 
     Raises:
         FileError: half a cannot be read.
         SettingsError: the frame does not fit.
     """
-    found = needs(sources, settings)
+    found = needs(sources, settings, extra=extra)
     needed = dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
     stage = max(needed, key=lambda name: needed[name])
     if needed[stage] > limit:
@@ -69,8 +77,11 @@ def scratch_within(limit: int, sources: Sources, settings: Settings) -> int:
     return int(limit - found.denoise - _OIDN)
 
 
-def needs(sources: Sources, settings: Settings) -> Needs:
-    """What a frame needs, by the header of half a; both halves are taken to be alike."""
+def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
+    """What a frame needs, by the header of half a; both halves are taken to be alike.
+
+    ``extra`` images beyond the halves are held as they are and denoised.
+    """
     file, _, layer = sources.a.partition("::")
     parts, stored = headers(file)
     height, width = parts[0].data_window.size
@@ -79,16 +90,16 @@ def needs(sources: Sources, settings: Settings) -> Needs:
     features = _features(sources, parts, layer or None)
     half = pixels * (_RGB + sum(features.values()))
     image = pixels * _RGB
-    aids = image * len(features.keys() & {"albedo", "normal"})
-    planes = 2 + len(features.keys() & {"albedo", "normal"}) + ("visibility" in features) / 3
+    aids = image * len(features.keys() & DENOISER_FEATURES)
+    planes = sum(buffer.channels for buffer in INPUTS if buffer not in FEATURES or buffer.name in features)
     trained = sum((b - t) * (r - x) for t, x, b, r in crops((height, width), settings, torch.Generator())) or pixels
-    training = 1.2 * trained * 2 * (planes * _RGB + 4)  # 1.2: margins
-    sub_images = len(sources.sub_images) * image
+    training = 1.2 * trained * 2 * 4 * (planes + 1)  # of both halves; 1.2: margins
+    beyond = extra * image
     evidence = pixels * 16 if settings.guard else 0
     return Needs(
-        read=_BASE + half + held + max(stored, half) + sub_images,
-        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * sub_images,
-        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * sub_images,
+        read=_BASE + half + held + max(stored, half) + beyond,
+        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * beyond,
+        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * beyond,
         write=_BASE + _WORK + 2 * image + held + max(stored, held),
     )
 
@@ -96,19 +107,15 @@ def needs(sources: Sources, settings: Settings) -> Needs:
 def _features(sources: Sources, parts: list[Header], layer: str | None) -> dict[str, int]:
     """Bytes of a pixel of each G-buffer of one half."""
     file = sources.a.partition("::")[0]
-    named = [(_name(part), [channel.name for channel in part.channels]) for part in parts]
-    full = [name for names in channels.full_names(named) for name in names]
+    named = [(part.name, [channel.name for channel in part.channels]) for part in parts]
+    full = [name for names in channels.full_names(named, parts[0].views) for name in names]
     types = dict(zip(full, (channel.type for part in parts for channel in part.channels), strict=True))
     taken = channels.choose(full, file=file, layer=layer, mapping=sources.mapping)
-    found = {
-        role: len(names) * max(_BYTES[types[name]] for name in names)
-        for role, names in taken.items()
-        if role not in ("color", "alpha", "denoised")
-    }
-    beside = {role: _RGB for role in channels.siblings(file) if role not in found}
-    return found | {role: size for role, size in beside.items() if role in ("albedo", "normal", "visibility", "depth")}
-
-
-def _name(part: Header) -> str:
-    attribute = part.attributes.get("name")
-    return "" if attribute is None else attribute.data.decode("utf-8", "replace")
+    beside = channels.siblings(file)
+    found = {}
+    for role in (feature.name for feature in FEATURES):
+        if role in taken:
+            found[role] = len(taken[role]) * max(_BYTES[types[name]] for name in taken[role])
+        elif role in beside:
+            found[role] = _RGB  # the most it can be: its file is not opened here
+    return found

@@ -4,13 +4,13 @@ import argparse
 from functools import partial
 from typing import Any
 
-from selfcorrect.cli.runner import Runner, add_run_flags, answer, log, mapping
-from selfcorrect.correct import Start
+from selfcorrect.cli import flags, pages
+from selfcorrect.cli.runner import Runner
+from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import FrameError
 from selfcorrect.settings import Settings
 from selfcorrect.shot import run as shot
 from selfcorrect.shot.framerange import parse_frames
-from selfcorrect.shot.sequence import follows
 from selfcorrect.shot.state import load_state
 from selfcorrect.stages.core.network import Network
 
@@ -36,45 +36,57 @@ def add(commands: Any) -> None:
         "--save-state", metavar="STATE.safetensors", help="keep the last frame's state here; with ####, that of each"
     )
     parser.add_argument("--fail-fast", action="store_true", help="end with the first frame that fails")
-    add_run_flags(parser)
+    pages.add_flag(parser)
+    flags.add_run_flags(parser)
     parser.set_defaults(run=_sequence)
 
 
 def _sequence(options: argparse.Namespace) -> int:
     """Returns how many frames failed."""
-    names = {"denoised_a": options.denoised_a, "denoised_b": options.denoised_b, "denoised": options.denoised_full}
     frames = parse_frames(options.frames)
-    work = shot.Shot(options.a, options.b, options.output, frames, **names, mapping=mapping(options))
+    work = shot.Shot(
+        a=options.a,
+        b=options.b,
+        output=options.output,
+        frames=frames,
+        **flags.denoised(options),
+        mapping=flags.mapping(options),
+    )
+    page = pages.ShotPage.at(options.report, frames)
     runner = Runner(options, given=options.denoised_a is not None)
-    given = None if options.warm_start is None else _given(options.warm_start, runner.settings)
-    habits = shot.Habits(
+    how = shot.Options(
         runner.settings,
         {"denoiser": runner.denoiser, "aov": options.aov},
         skip_existing=options.skip_existing,
         cold=options.cold,
-        warm_start=given,
+        warm_start=None if options.warm_start is None else _given(options.warm_start, runner.settings),
         save_state=options.save_state,
         fail_fast=options.fail_fast,
     )
 
     def one(job: shot.Job) -> shot.Done:
-        network = job.network
-        if network is not None and network is not given and not follows(network, job.loaded.frame):
-            log(f"frame {job.frame}: other buffers than the frame before: starts cold")
-            network = None
-        corrected = runner.correct(job.loaded, network, job.meanwhile)
-        log(f"frame {job.frame}: {_started(corrected.result.start)}")
         more = {"frame": job.frame, "recipe": job.recipe}
-        return shot.Done(corrected.result.network, partial(runner.write, job.output, corrected, more))
+        gather = None if page is None else page.gather(job.frame)
+        corrected = runner.correct(job.loaded, job.link.network, job.meanwhile, gather=gather, more=more)
+        log(f"frame {job.frame}: {corrected.facts.start_line()}")
+        return shot.Done(corrected.network, partial(runner.write, job.output, corrected))  # the frame is let go
 
     def report(outcome: shot.Outcome) -> None:
+        if page is not None:
+            page.told(outcome)
         if outcome.kind != "written":
             log(f"frame {outcome.frame}: {outcome.kind}: {outcome.reason or outcome.output}")
         if options.json:
-            told = outcome.report or {"output": outcome.output, "reason": outcome.reason}
+            told = {"output": outcome.output, "reason": outcome.reason}
+            if outcome.report is not None:
+                told = outcome.report.to_dict()
             answer({"frame": outcome.frame, "outcome": outcome.kind, **told})
 
-    failed = shot.run(work, habits, one, report, log)
+    try:
+        failed = shot.run(work, how, one, report, log)
+    finally:  # also after Ctrl-C: what is done can be looked at
+        if page is not None:
+            page.write(options.output, runner.settings, {"preset": options.preset, "denoiser": runner.denoiser})
     if failed:
         log(f"selfcorrect: {failed} of {len(frames)} frames failed")
     return failed
@@ -87,10 +99,3 @@ def _given(path: str, settings: Settings) -> Network:
     except FrameError as error:
         raise FrameError(f"{path}: {error}") from None
     return network
-
-
-def _started(start: Start) -> str:
-    if start.warm_loss is None:
-        return "started cold"
-    how = "started warm" if start.warm else "did not look like the frame before: started cold"
-    return f"{how} (loss before training {start.warm_loss:.5g} warm, {start.cold_loss:.5g} cold)"

@@ -40,10 +40,10 @@ __all__ = [
 Pixels = NDArray[Any]
 
 LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, IndexError, MemoryError)
-"""What the OpenEXR library raises for a file or an image that it does not like."""
+"""What the OpenEXR library raises for a file or an image that it refuses."""
 
 OUTPUT = threading.RLock()
-"""Held while the library is kept from stdout and stderr: who prints in another thread takes it, or is not heard."""
+"""Held while the library's stdout and stderr are silenced: take it to print from another thread, or lose the text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class ExrFile:
 
     @cached_property
     def _places(self) -> dict[str, tuple[int, str]]:
-        views = self.parts[0].header.get("multiView", [])
+        views = header.views(self.parts[0].attributes)
         full = channels.full_names([(part.name, list(part.channels)) for part in self.parts], views)
         return {
             name: (index, channel)

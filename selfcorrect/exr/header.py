@@ -1,6 +1,6 @@
 """The header of an OpenEXR file, read byte by byte and checked before the library sees the pixels.
 
-Four habits of the OpenEXR library make this needed: it allocates whatever a damaged data window claims; it
+Four properties of the OpenEXR library make this needed: it allocates whatever a damaged data window claims; it
 takes a file with missing chunks (an interrupted render) for a good one; it refuses a file for one letter of
 an attribute that is not UTF-8; and it hands out attributes as values, from which the bytes do not always
 come back (24/1 for 24000/1000).
@@ -17,7 +17,7 @@ import numpy as np
 
 from selfcorrect.errors import FileError
 
-__all__ = ["MAGIC", "Attribute", "Channel", "Header", "Window", "check", "parse", "readable", "restore"]
+__all__ = ["MAGIC", "Attribute", "Channel", "Header", "Window", "check", "parse", "readable", "restore", "views"]
 
 MAGIC = b"v/1\x01"
 """The first bytes of every OpenEXR file."""
@@ -26,7 +26,7 @@ _TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000
 _MOST_PIXELS = 2**31
 _PIXEL_BYTES = (4, 2, 4)
 _ANY = 65536.0
-"""Nobody bounds the other compressions; a black 4K frame came to 40,000 (measured, HTJ2K)."""
+"""The other compressions have no such bound; a black 4K frame came to 40,000 (measured, HTJ2K)."""
 
 _COMPRESSIONS = (
     ("none", 1, 1.0),
@@ -100,6 +100,29 @@ class Header:
     data_window: Window
     display_window: Window
     compression: int
+
+    @property
+    def name(self) -> str:
+        """The part's name; empty in most single-part files."""
+        attribute = self.attributes.get("name")
+        return "" if attribute is None else attribute.data.decode("utf-8", "replace")
+
+    @property
+    def views(self) -> list[str]:
+        """The views that a stereo file names."""
+        return views(self.attributes)
+
+
+def views(attributes: Mapping[str, Attribute]) -> list[str]:
+    """The views that these attributes of a file's first part name, in ``multiView``; none in most files."""
+    attribute = attributes.get("multiView")
+    data = b"" if attribute is None or attribute.type != "stringvector" else attribute.data
+    names = []
+    while len(data) >= 4:
+        length = int.from_bytes(data[:4], "little")
+        names.append(data[4 : 4 + length].decode("utf-8", "replace"))
+        data = data[4 + length :]
+    return names
 
 
 def parse(data: bytes | memoryview, file: str) -> tuple[list[Header], int]:
@@ -259,14 +282,14 @@ def _chunks(header: Header) -> int:
 
 def readable(data: bytes, headers: Sequence[Header]) -> bytes:
     """The file with ``?`` for every letter of a string attribute that is not UTF-8."""
-    mended = None
+    fixed = None
     for header in headers:
         for attribute in header.attributes.values():
             if attribute.type in {"string", "stringvector"} and not _is_text(attribute.data):
-                mended = mended or bytearray(data)
+                fixed = fixed or bytearray(data)
                 text = bytes(byte if byte < 128 else ord("?") for byte in attribute.data)
-                mended[attribute.offset : attribute.offset + len(text)] = text
-    return data if mended is None else bytes(mended)
+                fixed[attribute.offset : attribute.offset + len(text)] = text
+    return data if fixed is None else bytes(fixed)
 
 
 def _is_text(data: bytes) -> bool:

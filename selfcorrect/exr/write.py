@@ -5,7 +5,7 @@ What the OpenEXR library cannot keep by itself when a file passes through, and w
 - rationals in lowest terms only, strings in UTF-8 only, other NaNs: the bytes are put back after writing;
 - empty vectors and channel lists as attributes: handed over as opaque bytes;
 - the order of attributes and channels: written sorted, which the format leaves to the writer;
-- arrays that are not C-contiguous are written scrambled, without a word: all are made contiguous;
+- arrays that are not C-contiguous are written scrambled, without an error: all are made contiguous;
 - a file with DWA or B44 compression would lose precision in every channel once more: it is written with ZIP;
 - mip and rip maps lose all levels but the first: such files are refused (see :mod:`selfcorrect.exr.header`).
 

@@ -1,10 +1,13 @@
 """What the kernel reads: the guide buffers of one half, padded once, so that no border is left to handle."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from selfcorrect.buffers import COLOR, DENOISED, INPUTS, TERMS, Buffer
+from selfcorrect.errors import FrameError
 from selfcorrect.image.exposure import LARGEST
 
 __all__ = ["Guides", "mirror"]
@@ -28,8 +31,9 @@ def mirror(start: int, stop: int, size: int) -> Tensor:
 class Guides:
     """The guide buffers of one half, in planes mirrored ``margin`` pixels beyond the image.
 
-    ``planes`` is (C, H + 2·margin, W + 2·margin + slack) with the channels in the order of the paper's network
-    input: y(3), albedo(3), visibility(1), normal(3), z(3). A buffer that the frame does not have has no plane.
+    ``planes`` is (C, H + 2·margin, W + 2·margin + slack) with the channels in the order of the network's inputs
+    (:data:`selfcorrect.buffers.INPUTS`). A buffer that the frame does not have has no plane and is not in ``terms``,
+    which are in the order of :data:`selfcorrect.buffers.TERMS`.
 
     Guides of ``stacked`` crops of one size lie below one another, each with margins of its own: then height and width
     are those of a crop, and the first row of the next one is ``pitch`` rows further on.
@@ -39,46 +43,48 @@ class Guides:
     height: int
     width: int
     margin: int
-    has_albedo: bool
-    has_normal: bool
-    has_visibility: bool
+    terms: tuple[Buffer, ...]
     stacked: int = 1
 
     @classmethod
     def of_half(
         cls,
-        color: Tensor,
-        denoised: Tensor,
+        half: Mapping[str, Tensor | None],
         *,
         margin: int,
-        albedo: Tensor | None = None,
-        normal: Tensor | None = None,
-        visibility: Tensor | None = None,
         scale: float = 1.0,
         region: tuple[int, int, int, int] | None = None,
     ) -> "Guides":
         """Guides of one half from its (H, W, C) buffers, bounded by ±1e15.
 
         Args:
-            color, denoised, albedo, normal, visibility: the buffers.
+            half: the buffers by name, None or absent where there is none; those that Eq. 11 does not know are not
+                looked at.
             margin: pixels around, at least window // 2; beyond the image's border they are its mirror image.
             scale: what radiance is multiplied by.
             region: top, left, bottom, right of the pixels wanted, by default all.
+
+        Raises:
+            FrameError: there is no radiance, noisy or denoised.
         """
+        there = {name: buffer for name, buffer in half.items() if buffer is not None}
+        for needed in (COLOR, DENOISED):
+            if needed.name not in there:
+                raise FrameError(f"expected a half with the buffer {needed.name}, but got {', '.join(there) or 'none'}")
+        color = there[COLOR.name]
         top, left, bottom, right = region or (0, 0, *color.shape[:2])
         rows = mirror(top - margin, bottom + margin, color.shape[0]).to(color.device)
         columns = mirror(left - margin, right + margin + _LANES, color.shape[1]).to(color.device)
 
-        def cut(buffer: Tensor, factor: float = 1.0) -> Tensor:
-            part = buffer.index_select(0, rows).index_select(1, columns).permute(2, 0, 1)
-            if factor != 1.0:
-                return (part.double() * factor).clamp(-LARGEST, LARGEST).float()
+        def cut(term: Buffer) -> Tensor:
+            part = there[term.name].index_select(0, rows).index_select(1, columns).permute(2, 0, 1)
+            if term.kind == "radiance" and scale != 1.0:
+                return (part.double() * scale).clamp(-LARGEST, LARGEST).float()
             return part.float() if part.dtype == torch.float16 else part
 
-        parts = [cut(color, scale), *(cut(b) for b in (albedo, visibility, normal) if b is not None)]
-        planes = torch.cat([*parts, cut(denoised, scale)]).clamp_(-LARGEST, LARGEST)
-        present = (albedo is not None, normal is not None, visibility is not None)
-        return cls(planes, bottom - top, right - left, margin, *present)
+        planes = torch.cat([cut(term) for term in INPUTS if term.name in there]).clamp_(-LARGEST, LARGEST)
+        terms = tuple(term for term in TERMS if term.name in there)
+        return cls(planes, bottom - top, right - left, margin, terms)
 
     @classmethod
     def stack(cls, crops: "list[Guides]") -> "Guides":
@@ -91,14 +97,24 @@ class Guides:
         return self.height + 2 * self.margin
 
     @property
+    def scaled(self) -> tuple[Buffer, ...]:
+        """The terms that have a scale β in Eq. 10."""
+        return tuple(term for term in self.terms if term.scale)
+
+    @property
     def betas(self) -> int:
-        """Number of Eq. 10's scales β: three for each of z, albedo and normal."""
-        return 3 * (1 + self.has_albedo + self.has_normal)
+        """Number of Eq. 10's scales β: three for each of the terms that are scaled."""
+        return 3 * len(self.scaled)
 
     @property
     def gammas(self) -> int:
-        """Number of Eq. 11's bandwidths γ: y, z, and one for each G-buffer."""
-        return 2 + self.has_albedo + self.has_normal + self.has_visibility
+        """Number of Eq. 11's bandwidths γ: one for each term."""
+        return len(self.terms)
+
+    def channels(self, term: Buffer) -> slice:
+        """Where the term lies among the planes."""
+        before = sum(other.channels for other in INPUTS[: INPUTS.index(term)] if other in self.terms)
+        return slice(before, before + term.channels)
 
     @property
     def inner(self) -> Tensor:
@@ -109,12 +125,12 @@ class Guides:
     @property
     def radiance(self) -> Tensor:
         """The planes of y, (3, …)."""
-        return self.planes[:3]
+        return self.planes[self.channels(COLOR)]
 
     @property
     def denoised(self) -> Tensor:
         """The planes of z, (3, …)."""
-        return self.planes[-3:]
+        return self.planes[self.channels(DENOISED)]
 
     def views(self, corners: Tensor, size: tuple[int, int]) -> list[Tensor]:
         """N patches (C, h, w), nothing copied; ``corners`` (N, 2) are the rows and columns of their first pixels."""

@@ -5,27 +5,25 @@ its attribute ``selfcorrect/run`` carries the recipe it was made by. So a run th
 again, and two runs on the same shot do no more harm than to do the work twice.
 """
 
-import hashlib
-import json
 import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from selfcorrect import exr, files
 from selfcorrect.errors import FileError, SelfcorrectError
-from selfcorrect.exr import channels
 from selfcorrect.publish import remove_abandoned
 from selfcorrect.settings import Settings
+from selfcorrect.shot.chain import Chain, Link
 from selfcorrect.shot.framerange import fill, has_frame
+from selfcorrect.shot.recipe import recipe, unlike
 from selfcorrect.shot.state import State, check_state_target, save_state, state_after
 from selfcorrect.stages.core.network import Network
 
-__all__ = ["Done", "Habits", "Job", "Outcome", "Shot", "recipe", "run"]
+__all__ = ["Done", "Job", "Options", "Outcome", "Shot", "run"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Shot:
         frames: numbers in the order of the work.
         denoised_a: denoised half a, where the user has it.
         denoised_b: denoised half b.
-        denoised: denoised mean of both halves.
+        denoised_full: denoised mean of both halves.
         mapping: role → channel.
     """
 
@@ -49,7 +47,7 @@ class Shot:
     frames: Sequence[int]
     denoised_a: str | None = None
     denoised_b: str | None = None
-    denoised: str | None = None
+    denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
 
     def sources(self, frame: int) -> files.Sources:
@@ -58,9 +56,18 @@ class Shot:
         Raises:
             SettingsError: a name has no place for the number.
         """
-        given = {"denoised_a": self.denoised_a, "denoised_b": self.denoised_b, "denoised": self.denoised}
-        names: dict[str, Any] = {role: fill(name, frame) for role, name in given.items() if name is not None}
-        return files.Sources(fill(self.a, frame), fill(self.b, frame), **names, mapping=self.mapping)
+
+        def filled(name: str | None) -> str | None:
+            return None if name is None else fill(name, frame)
+
+        return files.Sources(
+            a=fill(self.a, frame),
+            b=fill(self.b, frame),
+            denoised_a=filled(self.denoised_a),
+            denoised_b=filled(self.denoised_b),
+            denoised_full=filled(self.denoised_full),
+            mapping=self.mapping,
+        )
 
     def target(self, frame: int) -> str:
         """The output of one frame."""
@@ -68,7 +75,7 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Habits:
+class Options:
     """How a shot is worked through.
 
     Attributes:
@@ -76,7 +83,8 @@ class Habits:
         made_by: what else decides the outputs, such as the denoiser's name: goes into the recipe.
         skip_existing: leave out frames whose output is whole and was made by the same recipe.
         cold: no frame starts from the one before.
-        warm_start: what the first frame starts from, and a frame whose predecessor was skipped and left no state.
+        warm_start: what the first frame starts from, and any that cannot go on from the one before it
+            (:mod:`selfcorrect.shot.chain` has the rule).
         save_state: file to keep the network in after every frame; with a place for the frame number, one for each.
         fail_fast: end with the first frame that fails.
     """
@@ -98,7 +106,7 @@ class Job(NamedTuple):
         output: the file to write.
         loaded: what was read.
         recipe: to be stored in the output.
-        network: what to start from.
+        link: what it takes from the frames before.
         meanwhile: to be called now and then during the work; reports the last frame once it is written.
     """
 
@@ -106,7 +114,7 @@ class Job(NamedTuple):
     output: str
     loaded: files.Loaded
     recipe: str
-    network: Network | None
+    link: Link
     meanwhile: Callable[[], None]
 
 
@@ -145,7 +153,7 @@ class _Fetched(NamedTuple):
 
 def run(
     shot: Shot,
-    habits: Habits,
+    options: Options,
     work: Callable[[Job], Done],
     report: Callable[[Outcome], None],
     note: Callable[[str], None],
@@ -157,7 +165,7 @@ def run(
 
     Args:
         shot: the files.
-        habits: how.
+        options: how.
         work: corrects one frame; called in this thread.
         report: told of every frame once it is written, skipped or has failed; called in this thread, in order.
         note: told in one line what a user may want to know, such as why an output was not good enough to skip.
@@ -169,22 +177,22 @@ def run(
         SelfcorrectError: the shot cannot be begun: a name without a place for the number, an output folder that is
             missing or cannot be written to.
     """
-    return _Run(shot, habits, work, report, note).all()
+    return _Run(shot, options, work, report, note).all()
 
 
 class _Run:
     def __init__(
         self,
         shot: Shot,
-        habits: Habits,
+        options: Options,
         work: Callable[[Job], Done],
         report: Callable[[Outcome], None],
         note: Callable[[str], None],
     ):
-        self.shot, self.habits, self.work, self.note, self._tell = shot, habits, work, note, report
+        self.shot, self.options, self.work, self.note, self._tell = shot, options, work, note, report
         self.failed = 0
         self._writing: deque[tuple[int, Future[Any]]] = deque()
-        self._network = habits.warm_start
+        self._chain = Chain(options.warm_start, cold=options.cold)
         self._skipped: tuple[int, str] | None = None  # the predecessor and its recipe, where it was skipped
 
     def all(self) -> int:
@@ -210,19 +218,18 @@ class _Run:
 
     @property
     def _ended(self) -> bool:
-        return self.habits.fail_fast and self.failed > 0
+        return self.options.fail_fast and self.failed > 0
 
     def _check(self) -> None:
         for frame in self.shot.frames[:1]:
             self._check_apart(self.shot.sources(frame), self.shot.target(frame))
             remove_abandoned(exr.check_target(self.shot.target(frame)).parent)
-            if self.habits.save_state is not None:
+            if self.options.save_state is not None:
                 remove_abandoned(check_state_target(self._state_file(frame)).parent)
 
     def _check_apart(self, sources: files.Sources, output: str) -> None:
         """An output in place of an input would be corrected once more by the run that resumes this one."""
-        given = (sources.a, sources.b, sources.denoised_a, sources.denoised_b, sources.denoised)
-        for path in given:
+        for path in sources.inputs:
             if path is not None and os.path.realpath(path.partition("::")[0]) == os.path.realpath(output):
                 raise FileError(f"{output}: expected an output apart from the inputs, but got one of them")
 
@@ -233,9 +240,9 @@ class _Run:
     def _fetch(self, frame: int) -> _Fetched:
         """In the reader's thread."""
         sources, output = self.shot.sources(frame), self.shot.target(frame)
-        made = recipe(sources, self.habits)
-        if self.habits.skip_existing and Path(output).exists():
-            reason = _unlike(output, made)
+        made = recipe(sources, self.options.settings, self.options.made_by, cold=self.options.cold)
+        if self.options.skip_existing and Path(output).exists():
+            reason = unlike(output, made)
             if not reason:
                 return _Fetched(made, None)
             self.note(f"frame {frame}: {reason}; it is made again")
@@ -249,38 +256,37 @@ class _Run:
             self._flush()
             self._report(Outcome(frame, output, "skipped"))
             return
-        network = self._start(frame)
+        link = self._link(fetched.loaded)
+        for note in link.notes:
+            self.note(f"frame {frame}: {note}")
+        job = Job(frame, output, fetched.loaded, fetched.recipe, link, lambda: self._flush(wait=False))
         try:
-            done = self.work(
-                Job(frame, output, fetched.loaded, fetched.recipe, network, lambda: self._flush(wait=False))
-            )
+            done = self.work(job)
         except SelfcorrectError as error:
             self._fail(frame, error)
             return
-        if not self.habits.cold:
-            self._network = done.network
+        self._chain.corrected(done.network)
         self._flush()
         self._writing.append((frame, writer.submit(self._write, frame, fetched.recipe, done)))
 
-    def _start(self, frame: int) -> Network | None:
-        """The network that a frame starts from."""
-        if self._skipped is not None and not self.habits.cold:
+    def _link(self, loaded: files.Loaded) -> Link:
+        """What a frame takes from those before it."""
+        if self._skipped is not None:  # the last one of several: only its state needs to be read
             before, made = self._skipped
-            state = state_after(self._state_file(before), before, made) if self.habits.save_state else None
-            self._network = state.network if state else self.habits.warm_start
-            how = "goes on from its state" if state else "left no state: this frame does not go on from it"
-            self.note(f"frame {frame}: frame {before} was there and {how}")
-        self._skipped = None
-        return self._network
+            reads = self.options.save_state is not None and not self.options.cold
+            state = state_after(self._state_file(before), before, made) if reads else None
+            self._chain.left_out(f"frame {before}", state.network if state else None)
+            self._skipped = None
+        return self._chain.link(loaded.frame)
 
     def _write(self, frame: int, made: str, done: Done) -> Any:
         """In the writer's thread. The state comes first: there is no output whose successor could not go on from it."""
-        if self.habits.save_state is not None and done.network is not None:
-            save_state(self._state_file(frame), State(done.network, frame, made), self.habits.settings)
+        if self.options.save_state is not None and done.network is not None:
+            save_state(self._state_file(frame), State(done.network, frame, made), self.options.settings)
         return done.write()
 
     def _state_file(self, frame: int) -> str:
-        pattern = str(self.habits.save_state)
+        pattern = str(self.options.save_state)
         return fill(pattern, frame) if has_frame(pattern) else pattern
 
     def _flush(self, *, wait: bool = True) -> None:
@@ -299,55 +305,3 @@ class _Run:
     def _report(self, outcome: Outcome) -> None:
         self.failed += outcome.kind == "failed"
         self._tell(outcome)
-
-
-def recipe(sources: files.Sources, habits: Habits) -> str:
-    """What an output is made by, as a digest: version, settings, denoiser, layers, and the bytes of every input.
-
-    Where the chain began is no part of it: the same frame may start cold in one chunk and warm in another.
-
-    Raises:
-        FileError: an input cannot be read.
-    """
-    given = (sources.a, sources.b, sources.denoised_a, sources.denoised_b, sources.denoised)
-    parts = [path.partition("::") for path in given if path]
-    beside = [
-        str(path) for half in (sources.a, sources.b) for path in channels.siblings(half.partition("::")[0]).values()
-    ]
-    contents = [_digest(path) for path in (*(path for path, _, _ in parts), *sorted(beside), *habits.settings.files)]
-    how = {
-        "version": version("selfcorrect"),
-        "settings": habits.settings.to_dict(),
-        "cold": habits.cold,
-        "made by": dict(habits.made_by),
-        "layers": [layer for _, _, layer in parts],
-        "given": [bool(path) for path in given],
-        "mapping": dict(sources.mapping or {}),
-        "contents": contents,
-    }
-    return hashlib.blake2b(json.dumps(how, sort_keys=True).encode(), digest_size=16).hexdigest()
-
-
-def _digest(path: str) -> str:
-    try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "blake2b").hexdigest()
-    except OSError as error:
-        raise FileError(f"{path}: expected an OpenEXR file, but got: {error.strerror}") from None
-
-
-def _unlike(output: str, made: str) -> str:
-    """Why an output that is there is not the one that this recipe makes; empty where it is."""
-    try:
-        header = exr.read(output).parts[0].header
-    except FileError as error:
-        return str(error)
-    try:
-        run = json.loads(header.get("selfcorrect/run", ""))
-    except ValueError:
-        run = None
-    if not isinstance(run, dict) or "recipe" not in run:
-        return f"{output}: expected an output of selfcorrect sequence, but got another file"
-    if run["recipe"] != made:
-        return f"{output}: expected an output of these inputs and settings, but got one of others"
-    return ""

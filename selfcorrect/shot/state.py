@@ -28,7 +28,7 @@ class State:
     Attributes:
         network: the network after its frame.
         frame: the frame's number, or None.
-        recipe: the recipe of the frame's output (:func:`selfcorrect.shot.run.recipe`), empty where there is none: it
+        recipe: the recipe of the frame's output (:func:`selfcorrect.shot.recipe.recipe`), empty where there is none: it
             ties the state to the output it was saved with.
     """
 

@@ -1,19 +1,18 @@
-"""The real command: what it writes, prints and refuses."""
+"""The command: what it writes, prints and refuses; in a process of its own once for each kind of end."""
 
 import json
 import os
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenEXR
 import pytest
-from helpers.commands import BALANCED, BOX, refused, run, write_half
+from helpers.commands import BALANCED, BOX, call, refused, run, write_half
 from helpers.onnx_models import NCHW, sum_of
 
-from selfcorrect import Settings, cli, exr
+from selfcorrect import Settings, exr
 
 PAPER = ["--preset", "paper"]
 FAST = [
@@ -55,9 +54,9 @@ def test_frame_writes_a_corrected_image_and_passes_the_rest_through(halves: tupl
     assert [p.name for p in tmp_path.iterdir() if "tmp" in p.name] == []
 
 
-def test_same_seed_writes_the_same_pixels(halves: tuple[Path, Path], tmp_path: Path, capsys: Any) -> None:
+def test_same_seed_writes_the_same_pixels(halves: tuple[Path, Path], tmp_path: Path) -> None:
     for name in ("one", "two"):
-        assert cli.main(["frame", *map(str, halves), "-o", str(tmp_path / f"{name}.exr"), *FAST]) == 0
+        assert call("frame", *halves, "-o", tmp_path / f"{name}.exr", *FAST).returncode == 0
     one, two = (exr.read(str(tmp_path / f"{name}.exr")) for name in ("one", "two"))
     np.testing.assert_array_equal(one.pixels("R"), two.pixels("R"))
 
@@ -66,7 +65,7 @@ def test_denoised_halves_of_the_user_are_taken(halves: tuple[Path, Path], tmp_pa
     out = tmp_path / "out.exr"
     given = [write_half(tmp_path / f"d{i}.exr", 10 + i) for i in range(2)]
     flags = [f for f in FAST if f not in ("--denoiser", "box")]
-    result = run("frame", *halves, "-o", out, "--denoised-a", given[0], "--denoised-b", given[1], *flags, "--json")
+    result = call("frame", *halves, "-o", out, "--denoised-a", given[0], "--denoised-b", given[1], *flags, "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["denoiser"] == "given"
 
@@ -76,7 +75,7 @@ def test_repairs_are_counted_in_the_log(tmp_path: Path) -> None:
     broken[3, 4:7] = np.nan
     broken[9, 9] = -1
     a, b = write_half(tmp_path / "a.exr", 1, R=broken), write_half(tmp_path / "b.exr", 2)
-    result = run("frame", a, b, "-o", tmp_path / "out.exr", *FAST)
+    result = call("frame", a, b, "-o", tmp_path / "out.exr", *FAST)
     assert result.returncode == 0, result.stderr
     assert "color: 3 pixels were NaN or infinite, 1 negative; repaired" in result.stderr
     assert np.isfinite(exr.read(str(tmp_path / "out.exr")).pixels("R")).all()
@@ -84,7 +83,7 @@ def test_repairs_are_counted_in_the_log(tmp_path: Path) -> None:
 
 def test_estimate_and_its_maps(halves: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "out.exr"
-    result = run("frame", *halves, "-o", out, *BALANCED, "--aov", "error,blend", "--json")
+    result = call("frame", *halves, "-o", out, *BALANCED, "--aov", "error,blend", "--json")
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     assert report["preset"] == Settings.default()
@@ -98,39 +97,39 @@ def test_estimate_and_its_maps(halves: tuple[Path, Path], tmp_path: Path) -> Non
 
 
 def test_no_guard_takes_the_corrected_image_as_it_is(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    result = run("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--no-guard", "--json")
+    result = call("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--no-guard", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["estimate"] is None
 
 
 def test_identical_halves_are_warned_of(halves: tuple[Path, Path], tmp_path: Path) -> None:
     shutil.copy(halves[0], tmp_path / "copy.exr")
-    result = run("frame", halves[0], tmp_path / "copy.exr", "-o", tmp_path / "out.exr", *BALANCED)
+    result = call("frame", halves[0], tmp_path / "copy.exr", "-o", tmp_path / "out.exr", *BALANCED)
     assert result.returncode == 0, result.stderr
     assert "warning: the halves are identical" in result.stderr
 
 
 def test_inspect(halves: tuple[Path, Path]) -> None:
-    text = run("inspect", halves[0])
+    text = call("inspect", halves[0])
     assert text.returncode == 0, text.stderr
     assert "nn.X" in text.stdout
     assert "data window" in text.stdout
-    report = json.loads(run("inspect", halves[0], "--json").stdout)
+    report = json.loads(call("inspect", halves[0], "--json").stdout)
     assert report["taken"]["color"] == ["R", "G", "B"]
 
 
 def test_compare(halves: tuple[Path, Path]) -> None:
-    same = json.loads(run("compare", halves[0], halves[0], "--json").stdout)
+    same = json.loads(call("compare", halves[0], halves[0], "--json").stdout)
     assert same["relmse"] == 0
     assert same["flip"] == 0
-    result = run("compare", *halves, halves[0], "--weight", halves[1])
+    result = call("compare", *halves, halves[0], "--weight", halves[1])
     assert result.returncode == 0, result.stderr
     for word in ("relMSE", "PSNR", "SSIM", "FLIP", "mean radiance ratio"):
         assert word in result.stdout
 
 
 def test_demo_corrects_the_packaged_frame(tmp_path: Path) -> None:
-    result = run("demo", "-o", tmp_path / "new", *FAST[:-4], "--denoiser", "joint-bilateral", "--json")
+    result = call("demo", "-o", tmp_path / "new", *FAST[:-4], "--denoiser", "joint-bilateral", "--json")
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     assert set(report["relmse"]) == {"noisy", "denoised", "corrected"}
@@ -224,7 +223,7 @@ class TestBadInput:
         assert "expected" in line
 
     def test_no_command(self) -> None:
-        assert "COMMAND" in refused()
+        assert "COMMAND" in refused(how=run)
 
     def test_an_existing_output_survives(self, halves: tuple[Path, Path], tmp_path: Path) -> None:
         out = tmp_path / "out.exr"
@@ -258,4 +257,4 @@ def test_a_frame_beyond_maxmem_is_refused_before_the_work(halves: tuple[Path, Pa
     line = refused("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--maxmem", "100M")
     assert "a.exr: expected --maxmem of at least" in line
     assert "6 apples" in refused("frame", *halves, "-o", tmp_path / "out.exr", "--maxmem", "6 apples")
-    assert run("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--maxmem", "2G").returncode == 0
+    assert call("frame", *halves, "-o", tmp_path / "out.exr", *BALANCED, "--maxmem", "2G").returncode == 0

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.commands import BOX, refused, run
+from helpers.commands import BOX, call, refused
 
 from selfcorrect import cli
 
@@ -66,7 +66,7 @@ def test_a_second_interrupt_writes_nothing(
         for _ in range(2):
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("selfcorrect.cli.runner._Progress.__call__", twice)
+    monkeypatch.setattr("selfcorrect.cli.terminal.Progress.__call__", twice)
     assert cli.main(["frame", *map(str, halves), "-o", str(out), *ENDLESS]) == 130
     assert len(asked) == 1
     assert "nothing" in capfd.readouterr().err
@@ -81,7 +81,7 @@ def test_a_time_that_is_none_is_named(halves: tuple[Path, Path], tmp_path: Path,
 
 
 def test_the_time_budget_ends_training(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    result = run("frame", *halves, "-o", tmp_path / "o.exr", *ENDLESS, "--time-budget", "0.05m", "--json")
+    result = call("frame", *halves, "-o", tmp_path / "o.exr", *ENDLESS, "--time-budget", "0.05m", "--json")
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     assert report["settings"]["time_budget"] == 3.0

@@ -1,5 +1,6 @@
 """Memory: the real command stays under what is told of it, and a frame that does not fit is refused at once."""
 
+import json
 import struct
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from helpers.commands import BALANCED, call
 
 from selfcorrect import Settings
 from selfcorrect.cli.memory import GIB, needs, parse_size, scratch_within
@@ -43,6 +45,7 @@ def write_half(path: Path, seed: int, size: tuple[int, int], dtype: type) -> str
 
 
 def sources(folder: Path, size: tuple[int, int] = (30, 40), dtype: type = np.float16) -> Sources:
+    folder.mkdir(exist_ok=True)
     return Sources(*(write_half(folder / f"{half}.exr", seed, size, dtype) for seed, half in enumerate("ab")))
 
 
@@ -97,6 +100,31 @@ def test_a_frame_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.exr").touch()
     with pytest.raises(FileError, match="an empty file"):
         needs(Sources(str(tmp_path / "empty.exr"), frame.b), settings)
+
+
+@pytest.mark.parametrize("layer", ["", "::left", "::right.ViewLayer"])
+def test_a_stereo_file_in_one_part_is_counted_as_it_is_read(tmp_path: Path, layer: str) -> None:
+    """Blender 4 puts the view behind the pass; only with the views that the header names is there a colour."""
+    names = [
+        f"ViewLayer.{name}.{view}.{letter}"
+        for view in ("left", "right")
+        for name, letters in (("Combined", "RGB"), ("Denoising Albedo", "RGB"), ("Denoising Depth", "Z"))
+        for letter in letters
+    ]
+    for seed, half in enumerate("ab"):
+        generator = np.random.default_rng(seed)
+        channels = {name: generator.random((24, 30), dtype=np.float32).astype(np.float16) for name in names}
+        header = {"type": OpenEXR.scanlineimage, "multiView": ["left", "right"]}
+        OpenEXR.File(header, channels).write(str(tmp_path / f"{half}.exr"))
+    a, b = (f"{tmp_path}/{half}.exr{layer}" for half in "ab")
+    plain = sources(tmp_path / "plain", (24, 30))
+    stereo, mono = (needs(each, Settings()) for each in (Sources(a, b), plain))
+    features = {"stereo": 3 * 2 + 1 * 2, "mono": 3 * 2 + 3 * 2}  # bytes of a pixel
+    assert mono.denoise - stereo.denoise == 24 * 30 * (2 * (features["mono"] - features["stereo"]) + 12)
+    result = call("frame", a, b, "-o", tmp_path / "out.exr", *BALANCED, "--maxmem", "4G", "--json")
+    assert result.returncode == 0, result.stderr
+    view = "right" if "right" in layer else "left"
+    assert json.loads(result.stdout)["channels"]["color"] == [f"{view}.ViewLayer.Combined.{c}" for c in "RGB"]
 
 
 @pytest.mark.parametrize(("text", "size"), [("6G", 6 * GIB), ("800M", 800 * 2**20), ("1.5gib", 3 * GIB // 2), ("9", 9)])

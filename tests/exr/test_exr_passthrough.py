@@ -165,7 +165,7 @@ ATTRIBUTES = [
 @pytest.mark.parametrize("compression", [0, 3], ids=["uncompressed", "zip"])
 @pytest.mark.parametrize("attribute", ATTRIBUTES, ids=[name[:20] for name, _, _ in ATTRIBUTES])
 def test_an_attribute_passes_through(tmp_path, attribute, compression):
-    """Compressed and uncompressed files go different ways through the library, and keep different things."""
+    """Compressed and uncompressed files take different paths through the library, and keep different things."""
     source, target = tmp_path / "a.exr", tmp_path / "out.exr"
     source.write_bytes(raw([attribute]))
     if compression:

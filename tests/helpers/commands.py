@@ -1,5 +1,7 @@
-"""The real command in a process of its own, and halves for it to read."""
+"""The command, in this process or in one of its own, and halves for it to read."""
 
+import contextlib
+import io
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +9,9 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
+import torch
+
+from selfcorrect import cli
 
 BOX = ["--denoiser", "box", "--threads", "1"]
 BALANCED = ["--steps", "4", "--patch", "16", "--batch", "2", "--window", "5", *BOX]
@@ -29,9 +34,26 @@ def run(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, **options)
 
 
-def refused(*arguments: object, **options: Any) -> str:
-    """The one line that a refused run prints; exit code 2, nothing on stdout."""
-    result = run(*arguments, **options)
+def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The command in this process, which starts nothing and is as it was afterwards."""
+    given, threads = [str(argument) for argument in arguments], torch.get_num_threads()
+    out, err = io.StringIO(), io.StringIO()
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = cli.main(given)
+    finally:
+        torch.set_num_threads(threads)
+    return subprocess.CompletedProcess(given, code, out.getvalue(), err.getvalue())
+
+
+def refused(*arguments: object, how: Any = call) -> str:
+    """The one line that a refused run prints; exit code 2, nothing on stdout.
+
+    Args:
+        arguments: of the command.
+        how: :func:`call`, or :func:`run` where the process is part of the test.
+    """
+    result = how(*arguments)
     assert result.returncode == 2, result.stderr
     assert result.stdout == ""
     lines = [line for line in result.stderr.splitlines() if line.startswith("selfcorrect: error: ")]

@@ -24,7 +24,7 @@ def done(name: str, *arguments: object) -> str:
 
 
 def refused(name: str, *arguments: object) -> str:
-    """The one line of an error that the user can mend."""
+    """The one line of an error that the user can fix."""
     result = script(name, *arguments)
     assert result.returncode == 2, result.stderr
     lines = [line for line in result.stderr.splitlines() if re.search(rf"{Path(name).name}(\.py)?: error: ", line)]

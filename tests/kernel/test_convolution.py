@@ -2,21 +2,18 @@
 
 import pytest
 import torch
+from helpers.kernel import TOLERANCE
 from torch import Tensor, nn
 
 from selfcorrect import Settings
-from selfcorrect.errors import FrameError
+from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.kernel import convolution
-from selfcorrect.kernel.convolution import convolutions
+from selfcorrect.kernel.convolution import cpu
+from selfcorrect.kernel.convolution import reference as in_torch
+from selfcorrect.kernel.convolution.cpu import convolutions
 from selfcorrect.stages.core.network import Network
 
-# Largest difference to float64 over the largest value: (values, gradients). Worst measured here: 7.7e-7 and 1.4e-6.
-SINGLE = (3e-6, 1e-5)
-# The same for bfloat16, by norm, against float64 with the same roundings. Single-precision sums may round to the
-# neighbouring bfloat16 (2^-8) where they lie on the edge, which few do. Worst measured here: 1.6e-4 and 4.6e-4.
-ROUNDED = (2**-10, 2**-9)
-
-VARIANTS = convolution.instruction_sets()
+VARIANTS = cpu.instruction_sets()
 SIZES = [(1, 1), (1, 17), (16, 1), (5, 7), (19, 19), (3, 130), (33, 65), (64, 64)]
 
 
@@ -41,11 +38,9 @@ def rounded(x: Tensor) -> Tensor:
 
 def reference(network: Network, images: Tensor, upstream: Tensor) -> list[Tensor]:
     """Heads and the gradients of all parameters, in float64."""
-    network.double()
-    raw = network.reference(images.double())
-    gradients = torch.autograd.grad(raw, list(network.parameters()), upstream.double())
-    network.float()
-    return [raw.detach(), *gradients]
+    parameters = [p.detach().double().requires_grad_() for p in network.parameters()]
+    raw = in_torch.convolutions(images.double(), parameters, log_radiance=network.log_radiance)
+    return [raw.detach(), *torch.autograd.grad(raw, parameters, upstream.double())]
 
 
 def rounded_reference(network: Network, images: Tensor, upstream: Tensor) -> list[Tensor]:
@@ -78,23 +73,23 @@ def compiled(network: Network, images: Tensor, upstream: Tensor, isa: str, threa
     return [raw.detach(), *torch.autograd.grad(raw, parameters, upstream)]
 
 
-def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: tuple[float, float]) -> None:
+def assert_close(got: list[Tensor], expected: list[Tensor], dtype: torch.dtype) -> None:
+    size, order = torch.linalg.vector_norm, torch.inf if dtype == torch.float32 else 2
     for i, (a, b) in enumerate(zip(got, expected, strict=True)):
         assert a.shape == b.shape
         assert a.isfinite().all()
-        size = torch.linalg.vector_norm
-        order = torch.inf if tolerance is SINGLE else 2
         worst = float(size(a.double() - b, order) / size(b, order).clamp(min=1e-9))
         name = "heads" if i == 0 else f"gradient of {'weight' if i % 2 else 'bias'} {(i - 1) // 2}"
-        assert worst < tolerance[i > 0], f"{name}: off by {worst:.2e}"
+        kind = "convolution gradients" if i else "convolution"
+        assert worst < TOLERANCE[dtype][kind], f"{name}: off by {worst:.2e}"
 
 
 def compare(network: Network, images: Tensor, isa: str) -> None:
     # of one sign, so that sums over pixels do not cancel and leave their rounding only
     upstream = random(images.shape[0], len(list(network.parameters())[-1]), *images.shape[2:], seed=3)
     exact = rounded_reference if isa == "amx" else reference
-    tolerance = ROUNDED if isa == "amx" else SINGLE
-    assert_close(compiled(network, images, upstream, isa), exact(network, images, upstream), tolerance)
+    dtype = torch.bfloat16 if isa == "amx" else torch.float32
+    assert_close(compiled(network, images, upstream, isa), exact(network, images, upstream), dtype)
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
@@ -192,9 +187,9 @@ def test_a_firefly_stays_in_its_neighbourhood(isa: str) -> None:
 
 
 def test_precision_chooses_the_variant() -> None:
-    assert convolution.best_instruction_set("fp32") != "amx"
-    assert (convolution.best_instruction_set("bf16") == "amx") == ("amx" in VARIANTS)
-    with pytest.raises(ValueError, match="instruction set"):
+    assert cpu.best_instruction_set("fp32") != "amx"
+    assert (cpu.best_instruction_set("bf16") == "amx") == ("amx" in VARIANTS)
+    with pytest.raises(SettingsError, match=r"expected an instruction set out of .*, but got sse9"):
         convolutions([random(3, 4, 4)], list(make_network(3, 4).parameters()), isa="sse9")
 
 
@@ -205,7 +200,7 @@ def test_what_the_kernel_does_not_do_torch_does(change: dict[str, int]) -> None:
     if not change:
         network.double()
     image = random(6, 9, 9).to(next(network.parameters()).dtype)
-    expected = network.reference(image[None])
+    expected = in_torch.convolutions([image], list(network.parameters()))
     assert torch.equal(network([image]), expected)
     assert torch.equal(network([image], region=(1, 2, 4, 9)), expected[:, :, 1:4, 2:9])
 
@@ -219,3 +214,18 @@ def test_regions_are_checked() -> None:
         for region in ((0, 0, 10, 9), (-1, 0, 9, 9), (3, 3, 3, 5)):
             with pytest.raises(FrameError, match="expected a region inside"):
                 network([image], region=region)
+
+
+def test_every_backend_gives_the_same() -> None:
+    parameters = list(make_network(6, 6).parameters())
+    images = [random(6, 9, 9), random(6, 9, 9, seed=4)]
+    region = (1, 2, 4, 9)
+    with torch.no_grad():
+        expected = convolution.convolutions(images, parameters, region=region, backend="reference")
+        got = convolution.convolutions(images, parameters, region=region)
+        assert torch.equal(got, convolution.convolutions(images, parameters, region=region, backend="cpu"))
+    torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+    with pytest.raises(SettingsError, match="at most 16 channels for the backend cpu"):
+        convolution.convolutions(images, list(make_network(6, 6, filters=17).parameters()), backend="cpu")
+    with pytest.raises(FrameError, match="expected images of one shape"):
+        convolution.convolutions([random(6, 9, 9), random(6, 9, 8)], parameters)

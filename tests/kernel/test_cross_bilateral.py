@@ -1,107 +1,73 @@
 """The kernel: gradcheck of the reference, and the compiled variants against it, values and every gradient."""
 
-from itertools import product
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
+from helpers.kernel import EVERY_SET, TOLERANCE, Terms, make_guides, make_raw, names, single, worst
 from torch import Tensor
 
+from selfcorrect.buffers import TERMS
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.image.exposure import LARGEST
-from selfcorrect.kernel.cross_bilateral import cpu, cross_bilateral, cross_bilateral_loss, heads_count, reference
-from selfcorrect.kernel.guides import Guides, mirror
+from selfcorrect.kernel import _cpu
+from selfcorrect.kernel.backend import BACKENDS, instruction_sets
+from selfcorrect.kernel.cross_bilateral import Window, cpu, cross_bilateral, cross_bilateral_loss, reference
+from selfcorrect.kernel.guides import Guides
 
-# Largest difference to the float64 reference, over the largest value: (values, gradients).
-# Worst measured over this file's cases: 1.7e-6 and 6.7e-6.
-TOLERANCE = {torch.float32: (1e-5, 3e-5)}
-
-BUFFERS = list(product((False, True), repeat=3))
-VARIANTS = cpu.instruction_sets()
-
-
-def make_guides(
-    height: int,
-    width: int,
-    buffers: tuple[bool, bool, bool] = (True, True, True),
-    *,
-    margin: int = 20,
-    dtype: torch.dtype = torch.float64,
-    seed: int = 0,
-) -> Guides:
-    generator = torch.Generator().manual_seed(seed)
-
-    def buffer(channels: int, low: float = 0.0) -> Tensor:
-        return low + (1 - low) * torch.rand(height, width, channels, generator=generator, dtype=dtype)
-
-    albedo, normal, visibility = buffers
-    return Guides.of_half(
-        4 * buffer(3) ** 3,
-        2 * buffer(3),
-        margin=margin,
-        albedo=buffer(3) if albedo else None,
-        normal=buffer(3, -1.0) if normal else None,
-        visibility=buffer(1) if visibility else None,
-    )
+SINGLE = TOLERANCE[torch.float32]
+VARIANTS = instruction_sets()
+ORIGIN = torch.zeros(1, 2, dtype=torch.int64)
+exact = partial(reference.cross_bilateral, taps_per_step=None)
+every_set = pytest.mark.parametrize("terms", EVERY_SET, ids=names)
 
 
-def make_raw(guides: Guides, combination: str, shape: tuple[int, int, int], scale: float = 1.0) -> Tensor:
-    generator = torch.Generator().manual_seed(1)
-    n, h, w = shape
-    return scale * torch.randn(n, heads_count(guides, combination), h, w, generator=generator, dtype=torch.float64)
-
-
-def single(guides: Guides) -> Guides:
-    values = vars(guides) | {"planes": guides.planes.float()}
-    return Guides(**values)
-
-
-def assert_close(name: str, got: Tensor, expected: Tensor, tolerance: float) -> None:
-    assert got.isfinite().all(), name
-    expected = expected.detach()
-    worst = float((got.detach().double() - expected).abs().max() / expected.abs().max().clamp(min=1e-9))
-    assert worst < tolerance, f"{name}: off by {worst:.2e} of the maximum"
-
-
-def compare(
-    guides: Guides, raw: Tensor, corners: Tensor, window: int, combination: str, isa: str, every: int = 1
-) -> None:
+def compare(guides: Guides, raw: Tensor, corners: Tensor, window: Window, isa: str, case: str = "") -> None:
     """Values and the gradient of every head, under a random upstream gradient."""
-    values, gradients = TOLERANCE[torch.float32]
     expected_raw = raw.clone().requires_grad_()
-    expected = reference.cross_bilateral(
-        guides, expected_raw, corners, window=window, every=every, combination=combination
-    )
+    expected = exact(guides, expected_raw, corners, window)
     upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     (expected * upstream).sum().backward()
 
     got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral(
-        single(guides), got_raw, corners, window=window, every=every, combination=combination, threads=2, isa=isa
-    )
+    got = cpu.cross_bilateral(single(guides), got_raw, corners, window, threads=2, isa=isa)
     (got * upstream.float()).sum().backward()
-    assert_close("g", got, expected, values)
-    for head in range(raw.shape[1]):
-        assert_close(f"head {head}", got_raw.grad[:, head], expected_raw.grad[:, head], gradients)
+    assert_close("g", got, expected, "cross-bilateral extreme" if case == "extreme" else "cross-bilateral")
+    if case == "saturated":
+        parts = [raw.grad.tensor_split([guides.betas], 1) for raw in (got_raw, expected_raw)]
+        of_scales, of_others = zip(*parts, strict=True)
+        assert_close("scales", *of_scales, "cross-bilateral saturated scales")
+        assert_heads_close(*of_others, "cross-bilateral saturated gradients")
+    else:
+        assert_heads_close(got_raw.grad, expected_raw.grad, "cross-bilateral gradients")
+
+
+def assert_close(name: str, got: Tensor, expected: Tensor, kind: str) -> None:
+    difference = worst(got, expected)
+    assert difference < SINGLE[kind], f"{name}: off by {difference:.2e} of the maximum"
+
+
+def assert_heads_close(got: Tensor, expected: Tensor, kind: str) -> None:
+    for head in range(expected.shape[1]):
+        assert_close(f"head {head}", got[:, head], expected[:, head], kind)
 
 
 @pytest.mark.parametrize("combination", ["eq10", "eq3"])
-@pytest.mark.parametrize("buffers", BUFFERS)
-def test_reference_gradcheck(buffers: tuple[bool, bool, bool], combination: str) -> None:
-    guides = make_guides(5, 6, buffers)
+@every_set
+def test_reference_gradcheck(terms: Terms, combination: str) -> None:
+    guides = make_guides(5, 6, terms)
     raw = make_raw(guides, combination, (2, 3, 3)).requires_grad_()
     corners = torch.tensor([[0, 0], [3, -2]])
-
-    def function(raw: Tensor) -> Tensor:
-        return reference.cross_bilateral(guides, raw, corners, window=3, combination=combination)
-
-    assert torch.autograd.gradcheck(function, raw)
+    window = Window(3, combination=combination)
+    assert torch.autograd.gradcheck(lambda raw: exact(guides, raw, corners, window), raw)
 
 
 def test_reference_by_hand() -> None:
     """Eqs. 10 and 11 with plain loops, at one pixel."""
     guides = make_guides(7, 7)
     raw = make_raw(guides, "eq10", (1, 7, 7))
-    got = reference.cross_bilateral(guides, raw, torch.zeros(1, 2, dtype=torch.int64), window=5)[0, :, 1, 2]
+    got = exact(guides, raw, ORIGIN, Window(5))[0, :, 1, 2]
     beta = torch.tanh(raw[0, :9, 1, 2]).reshape(3, 3)
     gamma = torch.log1p(torch.exp(raw[0, 9:14, 1, 2]))
     tau = torch.log1p(torch.exp(raw[0, 14, 1, 2])) + 1e-4
@@ -131,10 +97,9 @@ def test_taken_taps_are_a_lattice_with_the_centre(every: int) -> None:
     """What a pixel's output depends on: one tap in ``every``, in all rows."""
     guides = make_guides(15, 15)
     planes = guides.planes.clone().requires_grad_()
-    watched = Guides(**(vars(guides) | {"planes": planes}))
+    watched = replace(guides, planes=planes)
     raw = make_raw(guides, "eq10", (1, 1, 1))
-    corners = torch.tensor([[7, 7]])
-    reference.cross_bilateral(watched, raw, corners, window=15, every=every).sum().backward()
+    reference.cross_bilateral(watched, raw, torch.tensor([[7, 7]]), Window(15, every)).sum().backward()
     m = guides.margin
     taken = planes.grad[0, m : m + 15, m : m + 15] != 0
     assert taken[7, 7]
@@ -142,43 +107,48 @@ def test_taken_taps_are_a_lattice_with_the_centre(every: int) -> None:
     assert abs(int(taken.sum()) - 225 / every) < 4
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
-@pytest.mark.parametrize("every", [2, 3, 4, 5])
-def test_cpu_matches_reference_on_a_lattice(every: int, isa: str) -> None:
-    guides = make_guides(20, 19)
-    raw = make_raw(guides, "eq10", (2, 17, 18))
-    compare(guides, raw, torch.tensor([[-2, 1], [3, 0]]), 9, "eq10", isa, every)
-
-
 @pytest.mark.parametrize("taps", [1, 7])
 def test_reference_in_steps_is_the_same(taps: int) -> None:
     guides = make_guides(9, 8)
     corners = torch.tensor([[-1, 2]])
     raw = [make_raw(guides, "eq10", (1, 6, 5)).requires_grad_() for _ in range(2)]
-    whole = reference.cross_bilateral(guides, raw[0], corners, window=5)
-    steps = reference.cross_bilateral(guides, raw[1], corners, window=5, taps_per_step=taps)
+    whole = exact(guides, raw[0], corners, Window(5))
+    steps = reference.cross_bilateral(guides, raw[1], corners, Window(5), taps_per_step=taps)
     torch.testing.assert_close(steps, whole)
     whole.square().sum().backward()
     steps.square().sum().backward()
     torch.testing.assert_close(raw[1].grad, raw[0].grad)
 
 
+def test_the_compiled_kernel_has_the_tables_terms() -> None:
+    assert _cpu.terms() == [term.name for term in TERMS]
+
+
 @pytest.mark.parametrize("isa", VARIANTS)
 @pytest.mark.parametrize("combination", ["eq10", "eq3"])
-@pytest.mark.parametrize("buffers", BUFFERS)
-def test_cpu_matches_reference(buffers: tuple[bool, bool, bool], combination: str, isa: str) -> None:
-    guides = make_guides(23, 37, buffers)
+@every_set
+def test_cpu_matches_reference(terms: Terms, combination: str, isa: str) -> None:
+    guides = make_guides(23, 37, terms)
     corners = torch.tensor([[0, 0], [-5, 10], [12, 20]])
-    compare(guides, make_raw(guides, combination, (3, 13, 19)), corners, 7, combination, isa)
+    raw = make_raw(guides, combination, (3, 13, 19))
+    compare(guides, raw, corners, Window(7, combination=combination), isa)
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
-@pytest.mark.parametrize("window", [1, 3, 19, 31])
+@pytest.mark.parametrize("every", [2, 3, 4, 5])
+def test_cpu_matches_reference_on_a_lattice(every: int, isa: str) -> None:
+    guides = make_guides(20, 19)
+    raw = make_raw(guides, "eq10", (2, 17, 18))
+    compare(guides, raw, torch.tensor([[-2, 1], [3, 0]]), Window(9, every), isa)
+
+
+@pytest.mark.parametrize("isa", VARIANTS)
+@pytest.mark.parametrize("side", [1, 3, 19, 31])
 @pytest.mark.parametrize("size", [(1, 1), (1, 17), (16, 1), (5, 7), (33, 15)])
-def test_cpu_at_awkward_sizes(size: tuple[int, int], window: int, isa: str) -> None:
+def test_cpu_at_awkward_sizes(size: tuple[int, int], side: int, isa: str) -> None:
     """Images smaller than the window, one pixel, one more and less than a vector."""
     guides = make_guides(*size)
-    compare(guides, make_raw(guides, "eq10", (1, *size)), torch.zeros(1, 2, dtype=torch.int64), window, "eq10", isa)
+    compare(guides, make_raw(guides, "eq10", (1, *size)), ORIGIN, Window(side), isa)
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
@@ -186,72 +156,75 @@ def test_cpu_takes_any_strides(isa: str) -> None:
     guides = make_guides(20, 20)
     raw = make_raw(guides, "eq10", (2, 18, 20))
     corners = torch.tensor([[0, 0], [1, -1]])
-    compare(guides, raw.contiguous(memory_format=torch.channels_last), corners, 5, "eq10", isa)
-    compare(guides, raw.transpose(2, 3).contiguous().transpose(2, 3), corners, 5, "eq10", isa)
+    compare(guides, raw.contiguous(memory_format=torch.channels_last), corners, Window(5), isa)
+    compare(guides, raw.transpose(2, 3).contiguous().transpose(2, 3), corners, Window(5), isa)
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
 @pytest.mark.parametrize("scale", [10.0, 100.0])
 def test_cpu_with_saturated_heads(scale: float, isa: str) -> None:
-    """β = ±1, bandwidths of 0 and of hundreds: finite, and the value still right."""
+    """β = ±1, bandwidths of 0 and of hundreds.
+
+    Where every pixel of a scale's head is saturated, its gradient is only what rounding leaves of 1 − β²: as in torch.
+    So the scales are measured by the largest gradient of all of them.
+    """
     guides = make_guides(20, 20)
-    raw = make_raw(guides, "eq10", (1, 20, 20), scale)
-    corners = torch.zeros(1, 2, dtype=torch.int64)
-    expected = reference.cross_bilateral(guides, raw, corners, window=9)
-    got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral(
-        single(guides), got_raw, corners, window=9, every=1, combination="eq10", threads=1, isa=isa
-    )
-    got.sum().backward()
-    assert_close("g", got, expected, 1e-4)
-    assert got_raw.grad.isfinite().all()
+    compare(guides, make_raw(guides, "eq10", (1, 20, 20), scale), ORIGIN, Window(9), isa, "saturated")
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
 def test_cpu_with_extreme_radiance(isa: str) -> None:
+    """A firefly as bright as guides can be: right in what sees it, and as right as ever in what does not."""
     guides = make_guides(20, 20)
     guides.planes[0, 25, 25] = LARGEST
     raw = make_raw(guides, "eq10", (1, 20, 20))
-    corners = torch.zeros(1, 2, dtype=torch.int64)
-    expected = reference.cross_bilateral(guides, raw, corners, window=9)
-    got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral(
-        single(guides), got_raw, corners, window=9, every=1, combination="eq10", threads=1, isa=isa
-    )
-    assert_close("g", got, expected, 1e-4)
-    got.sum().backward()
-    assert got_raw.grad.isfinite().all()
+    compare(guides, raw, ORIGIN, Window(9), isa, "extreme")
+    far = torch.tensor([[10, 10]])
+    compare(guides, raw[:, :, 10:, 10:], far, Window(9), isa)
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
-@pytest.mark.parametrize("buffers", [(True, True, True), (False, True, False)])
-def test_fused_loss_matches_reference(buffers: tuple[bool, bool, bool], isa: str) -> None:
-    guides = make_guides(21, 33, buffers)
-    other = make_guides(21, 33, buffers, seed=5)
+@pytest.mark.parametrize("terms", [EVERY_SET[0], EVERY_SET[-1]], ids=names)
+def test_fused_loss_matches_reference(terms: Terms, isa: str) -> None:
+    guides = make_guides(21, 33, terms)
+    other = make_guides(21, 33, terms, seed=5)
     weight = 1 / (other.denoised.mean(0) ** 2 + 0.01)
     corners = torch.tensor([[0, 0], [-4, 18]])
     raw = make_raw(guides, "eq10", (2, 17, 21))
     expected_raw = raw.clone().requires_grad_()
-    expected = cross_bilateral_loss(guides, expected_raw, corners, other.radiance, weight, window=5)
+    expected = reference.cross_bilateral_loss(guides, expected_raw, corners, other.radiance, weight, Window(5))
     (3 * expected).backward()
     got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral_loss(
-        single(guides),
-        got_raw,
-        corners,
-        other.radiance.float(),
-        weight.float(),
-        window=5,
-        every=1,
-        combination="eq10",
-        threads=2,
-        isa=isa,
-    )
+    target, weight = other.radiance.float(), weight.float()
+    got = cpu.cross_bilateral_loss(single(guides), got_raw, corners, target, weight, Window(5), threads=2, isa=isa)
     (3 * got).backward()
-    values, gradients = TOLERANCE[torch.float32]
-    assert_close("loss", got, expected, values)
-    for head in range(raw.shape[1]):
-        assert_close(f"head {head}", got_raw.grad[:, head], expected_raw.grad[:, head], gradients)
+    assert_close("loss", got, expected, "cross-bilateral")
+    assert_heads_close(got_raw.grad, expected_raw.grad, "cross-bilateral gradients")
+
+
+def test_reference_loss_is_the_weighted_mean_square() -> None:
+    """Half of Eq. 8 with the cut of the other half taken by hand."""
+    guides, other = make_guides(12, 14), make_guides(12, 14, seed=5)
+    raw = make_raw(guides, "eq10", (1, 6, 7))
+    corners = torch.tensor([[3, -2]])
+    weight = other.planes[3].abs()
+    got = reference.cross_bilateral_loss(guides, raw, corners, other.radiance, weight, Window(3))
+    at = (slice(23, 29), slice(18, 25))
+    g = exact(guides, raw, corners, Window(3))[0]
+    torch.testing.assert_close(got, (0.5 * weight[at] * (g - other.radiance[:, *at]) ** 2).mean())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_every_backend_gives_the_same(backend: str) -> None:
+    """Through the function that callers use: what it chooses by itself is the compiled form."""
+    guides = single(make_guides(12, 14))
+    raw = make_raw(guides, "eq10", (1, 12, 14)).float()
+    arguments = (guides, raw, ORIGIN)
+    loss = (*arguments, guides.denoised, guides.planes[3].abs())
+    for function, given in ((cross_bilateral, arguments), (cross_bilateral_loss, loss)):
+        chosen, got = function(*given, Window(5)), function(*given, Window(5), backend=backend)
+        torch.testing.assert_close(got, chosen, rtol=1e-5, atol=1e-5)
+        assert backend != "cpu" or torch.equal(got, chosen)
 
 
 def test_threads_do_not_change_a_bit() -> None:
@@ -261,7 +234,8 @@ def test_threads_do_not_change_a_bit() -> None:
     results = []
     for threads in (1, 2, 5):
         leaf = raw.clone().requires_grad_()
-        loss = cross_bilateral_loss(guides, leaf, corners, guides.denoised, guides.planes[3], window=7, threads=threads)
+        weight = guides.planes[3]
+        loss = cross_bilateral_loss(guides, leaf, corners, guides.denoised, weight, Window(7), threads=threads)
         loss.backward()
         results.append((loss.detach(), leaf.grad))
     for loss, gradient in results[1:]:
@@ -269,36 +243,30 @@ def test_threads_do_not_change_a_bit() -> None:
         assert torch.equal(gradient, results[0][1])
 
 
-def test_mirror_is_numpy_symmetric() -> None:
-    import numpy as np
-
-    for size in (1, 2, 5):
-        expected = np.pad(np.arange(size), 13, mode="symmetric")
-        assert mirror(-13, size + 13, size).tolist() == expected.tolist()
-
-
 def test_patches_read_neighbours_from_the_whole_image() -> None:
     """A patch cut out of the middle gives what the whole image gives there."""
     guides = single(make_guides(30, 40))
     raw = make_raw(guides, "eq10", (1, 30, 40)).float()
-    whole = cross_bilateral(guides, raw, torch.zeros(1, 2, dtype=torch.int64), window=19)
-    part = cross_bilateral(guides, raw[:, :, 8:20, 3:36], torch.tensor([[8, 3]]), window=19)
+    whole = cross_bilateral(guides, raw, ORIGIN, Window(19))
+    part = cross_bilateral(guides, raw[:, :, 8:20, 3:36], torch.tensor([[8, 3]]), Window(19))
     torch.testing.assert_close(part, whole[:, :, 8:20, 3:36], rtol=1e-6, atol=1e-6)
 
 
 def test_bad_arguments_are_named() -> None:
     guides = single(make_guides(8, 8, margin=4))
     raw = make_raw(guides, "eq10", (1, 8, 8)).float()
-    corners = torch.zeros(1, 2, dtype=torch.int64)
-    with pytest.raises(SettingsError, match="odd window"):
-        cross_bilateral(guides, raw, corners, window=4)
-    with pytest.raises(SettingsError, match="odd window"):
-        cross_bilateral(guides, raw, corners, window=33)
+    for side in (4, 33, -1):
+        with pytest.raises(SettingsError, match="odd window"):
+            Window(side)
+    with pytest.raises(SettingsError, match="one tap in 1 or more"):
+        Window(3, 0)
     with pytest.raises(SettingsError, match="combination"):
-        cross_bilateral(guides, raw, corners, window=3, combination="eq4")
+        Window(3, combination="eq4")
     with pytest.raises(FrameError, match=r"\(N, 15, h, w\)"):
-        cross_bilateral(guides, raw[:, :14], corners, window=3)
+        cross_bilateral(guides, raw[:, :14], ORIGIN, Window(3))
     with pytest.raises(FrameError, match="margin"):
-        cross_bilateral(guides, raw, corners - 4, window=3)
+        cross_bilateral(guides, raw, ORIGIN - 4, Window(3))
     with pytest.raises(FrameError, match="int64"):
-        cross_bilateral(guides, raw, corners.float(), window=3)
+        cross_bilateral(guides, raw, ORIGIN.float(), Window(3))
+    with pytest.raises(FrameError, match=r"torch\.float32, but got torch\.float64"):
+        cross_bilateral(guides, raw.double(), ORIGIN, Window(3))

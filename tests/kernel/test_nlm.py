@@ -5,16 +5,17 @@ from functools import partial
 
 import pytest
 import torch
+from helpers.kernel import TOLERANCE as TABLE
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
+from selfcorrect.image.windows import reflect
 from selfcorrect.kernel import nlm, regression
-from selfcorrect.kernel.cross_bilateral.cpu import instruction_sets
+from selfcorrect.kernel.backend import instruction_sets
+from selfcorrect.kernel.nlm import cpu
 from selfcorrect.kernel.nlm import reference as nlm_reference
 
-# Largest difference to the float64 reference, over the largest value. Worst measured over this file's cases: 2e-6.
-TOLERANCE = 1e-5
-
+TOLERANCE = TABLE[torch.float32]["nlm"]
 VARIANTS = instruction_sets()
 OPTIONS = {"radius": 3, "patch_radius": 2, "k": 0.6}
 
@@ -52,7 +53,7 @@ def test_reference_by_hand() -> None:
 def test_awkward_sizes(size: tuple[int, int], channels: int, isa: str) -> None:
     arguments = make(size, channels)
     expected = nlm_reference.non_local_means(*arguments, **OPTIONS)
-    got = nlm.non_local_means(*(a.float() for a in arguments), **OPTIONS, threads=2, isa=isa)
+    got = cpu.non_local_means(*(a.float() for a in arguments), **OPTIONS, threads=2, isa=isa)
     assert float((got - expected).abs().max() / expected.abs().max()) < TOLERANCE
 
 
@@ -62,7 +63,7 @@ def test_radii(radius: int, patch_radius: int, isa: str) -> None:
     arguments = make((14, 18))
     options = {"radius": radius, "patch_radius": patch_radius, "k": 0.5}
     expected = nlm_reference.non_local_means(*arguments, **options)
-    got = nlm.non_local_means(*(a.float() for a in arguments), **options, isa=isa)
+    got = cpu.non_local_means(*(a.float() for a in arguments), **options, isa=isa)
     assert float((got - expected).abs().max() / expected.abs().max()) < TOLERANCE
 
 
@@ -79,7 +80,7 @@ def test_strips_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
         ]
 
     whole = both()
-    monkeypatch.setattr(nlm, "_STRIP", 49 * 32 * 3)
+    monkeypatch.setattr(cpu, "_STRIP", 49 * 32 * 3)
     for one, other in zip(whole, both(), strict=True):
         assert torch.equal(one, other)
 
@@ -90,11 +91,11 @@ def test_regression_with_these_weights(isa: str) -> None:
     x, u, v = make((9, 11))
     feature = image((9, 11), 3, 7)
     radius = 3
-    got = regression.regress_non_local(
-        [feature], x, partial(nlm.strips, u, v, **OPTIONS, isa=isa), radius=radius, ridge=1e-3, isa=isa
+    got = regression.cpu.regress_non_local(
+        [feature], x, partial(cpu.strips, u, v, **OPTIONS, isa=isa), radius=radius, ridge=1e-3, isa=isa
     )
     w = nlm_reference.weights(u, v, **OPTIONS)
-    rows, columns = (nlm.reflect(-radius, n + radius, n) for n in (9, 11))
+    rows, columns = (reflect(-radius, n + radius, n) for n in (9, 11))
 
     def around(row: int, column: int) -> tuple[Tensor, Tensor]:
         y, x = torch.meshgrid(rows[row : row + 7], columns[column : column + 7], indexing="ij")
@@ -125,7 +126,7 @@ def test_extremes_stay_finite(isa: str) -> None:
     guide[2, 3], values[2, 3], variance[2, 3] = 1e20, 1e20, 3e38
     variance[5] = 0
     guide[7] = 0.25
-    assert nlm.non_local_means(values, guide, variance, **OPTIONS, isa=isa).isfinite().all()
+    assert cpu.non_local_means(values, guide, variance, **OPTIONS, isa=isa).isfinite().all()
 
 
 def test_bad_arguments_are_named() -> None:
@@ -137,3 +138,15 @@ def test_bad_arguments_are_named() -> None:
     for wrong in ({"radius": 16}, {"patch_radius": -1}, {"k": 0.0}):
         with pytest.raises(SettingsError, match="radius to 15"):
             nlm.non_local_means(values, guide, variance, **OPTIONS | wrong)
+
+
+def test_every_backend_gives_the_same() -> None:
+    """Also of half floats and doubles: the compiled form turns them into float32."""
+    arguments = make((10, 12))
+    expected = nlm.non_local_means(*arguments, **OPTIONS, backend="reference")
+    assert expected.dtype == torch.float64
+    assert torch.equal(expected, nlm_reference.non_local_means(*arguments, **OPTIONS))
+    got = nlm.non_local_means(*arguments, **OPTIONS)
+    assert torch.equal(got, nlm.non_local_means(*arguments, **OPTIONS, backend="cpu"))
+    assert torch.equal(got, nlm.non_local_means(*(a.float() for a in arguments), **OPTIONS))
+    assert float((got - expected).abs().max() / expected.abs().max()) < TOLERANCE

@@ -2,16 +2,15 @@
 
 import pytest
 import torch
+from helpers.kernel import TOLERANCE as TABLE
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
-from selfcorrect.kernel.cross_bilateral.cpu import instruction_sets
+from selfcorrect.kernel.backend import instruction_sets
+from selfcorrect.kernel.regression import cpu, regress
 from selfcorrect.kernel.regression import reference as regression_reference
-from selfcorrect.kernel.regression import regress
 
-# Largest difference to the float64 reference, over the largest value. Worst measured over this file's cases: 4e-6.
-TOLERANCE = 1e-4
-
+TOLERANCE = TABLE[torch.float32]["regression"]
 VARIANTS = instruction_sets()
 GROUPS = [(v, s) for v in range(4) for s in range(3) if v + s]
 OPTIONS = {"window": 7, "ridge": 1e-3, "bandwidth": 0.5}
@@ -26,11 +25,11 @@ def make(size: tuple[int, int], vectors: int = 3, scalars: int = 2) -> tuple[lis
     return features, 4 * image(size, 3, 20) ** 3
 
 
-def compare(features: list[Tensor], targets: Tensor, isa: str, tolerance: float = TOLERANCE, **options: float) -> None:
+def compare(features: list[Tensor], targets: Tensor, isa: str, **options: float) -> None:
     expected = regression_reference.regress(features, targets, **OPTIONS | options)
-    got = regress(features, targets, **OPTIONS | options, threads=2, isa=isa)
+    got = cpu.regress(features, targets, **OPTIONS | options, threads=2, isa=isa)
     worst = float((got.double() - expected).abs().max() / expected.abs().max().clamp(min=1e-9))
-    assert worst < tolerance, f"off by {worst:.2e} of the maximum"
+    assert worst < TOLERANCE, f"off by {worst:.2e} of the maximum"
 
 
 def test_reference_by_hand() -> None:
@@ -82,7 +81,7 @@ def test_windows(window: int, isa: str) -> None:
 
 @pytest.mark.parametrize("isa", VARIANTS)
 def test_rank_deficient_windows(isa: str) -> None:
-    """Constant features, a feature given twice, a black region: no slope where nothing tells one."""
+    """Constant features, a feature given twice, a black region: no slope where nothing determines one."""
     features, targets = make((12, 20), 2, 2)
     features[1] = features[0].clone()
     features[2][:] = 0.3
@@ -100,7 +99,7 @@ def test_a_pixel_like_no_centre(isa: str) -> None:
     features, targets = make((12, 20))
     features[0][3, 5] += 100.0
     compare(features, targets, isa, stride=2)
-    assert regress(features, targets, **OPTIONS, stride=2, isa=isa)[3, 5].abs().min() > 1e-3
+    assert cpu.regress(features, targets, **OPTIONS, stride=2, isa=isa)[3, 5].abs().min() > 1e-3
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
@@ -108,7 +107,7 @@ def test_a_firefly_stays_finite(isa: str) -> None:
     features, targets = make((12, 20))
     targets[3, 4] = 1e20
     features[0][5, 6] = 1e20
-    result = regress(features, targets, **OPTIONS, isa=isa)
+    result = cpu.regress(features, targets, **OPTIONS, isa=isa)
     assert result.isfinite().all()
 
 
@@ -138,3 +137,12 @@ def test_bad_arguments_are_named() -> None:
             regress(wrong, targets, **OPTIONS)
     with pytest.raises(FrameError, match="targets"):
         regress(features, targets[..., :2], **OPTIONS)
+
+
+def test_every_backend_gives_the_same() -> None:
+    features, targets = make((10, 12))
+    expected = regress(features, targets, **OPTIONS, stride=2, backend="reference")
+    assert torch.equal(expected, regression_reference.regress(features, targets, **OPTIONS, stride=2))
+    got = regress(features, targets, **OPTIONS, stride=2)
+    assert torch.equal(got, regress(features, targets, **OPTIONS, stride=2, backend="cpu"))
+    assert float((got.double() - expected).abs().max() / expected.abs().max()) < TOLERANCE

@@ -181,7 +181,7 @@ def test_samples_in_several_passes(scene: Path, monkeypatch: pytest.MonkeyPatch)
     ],
 )
 @pytest.mark.mitsuba
-def test_what_a_user_of_mitsuba_can_mend(scene: Path, tmp_path: Path, flags: list[str], word: str) -> None:
+def test_what_a_user_of_mitsuba_can_fix(scene: Path, tmp_path: Path, flags: list[str], word: str) -> None:
     line = refused("render/render_mitsuba", scene, "-o", tmp_path, "--spp", 2, *SCALAR, *flags)
     assert re.search(word, line), line
     assert list(tmp_path.iterdir()) == []
@@ -261,7 +261,7 @@ def test_a_driven_seed_is_freed(blend: Path, tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.blender
-def test_what_a_user_of_blender_can_mend(blend: Path, tmp_path: Path, code: str, word: str) -> None:
+def test_what_a_user_of_blender_can_fix(blend: Path, tmp_path: Path, code: str, word: str) -> None:
     line = refused("render/render_blender", changed(blend, code), "-o", tmp_path, "--spp", 2, "--size", "32x18")
     assert word in line
     assert list(tmp_path.iterdir()) == []

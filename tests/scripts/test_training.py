@@ -164,7 +164,7 @@ class TestDenoiser:
 
 
 class TestTraining:
-    def test_a_killed_run_goes_on_with_the_losses_of_an_unbroken_one(self, data: Path, tmp_path: Path) -> None:
+    def test_a_killed_run_continues_with_the_losses_of_an_unbroken_one(self, data: Path, tmp_path: Path) -> None:
         steps = ("--steps", 14)
         ran(*training("denoiser", data, tmp_path / "unbroken", *steps))
         broken = training("denoiser", data, tmp_path / "broken", *steps, "--checkpoint-seconds", 0)
@@ -184,7 +184,7 @@ class TestTraining:
         for name in ("network", "mean"):
             assert all(torch.equal(a, b) for a, b in zip(*(state[name].values() for state in states), strict=True))
 
-    def test_another_run_is_not_gone_on_with(self, data: Path, runs: Path) -> None:
+    def test_another_run_is_not_continued(self, data: Path, runs: Path) -> None:
         with pytest.raises(SystemExit, match="use another --out"):
             ran(*training("denoiser", data, runs / "denoiser", "--steps", 5))
 
@@ -271,9 +271,8 @@ class TestEvaluate:
 
 
 @pytest.mark.mitsuba
-@pytest.mark.llvm
 def test_rendered_views_go_all_the_way(tmp_path: Path) -> None:
-    """Two procedural rooms, really rendered, trained on and measured."""
+    """Two procedural rooms, really rendered by whichever variant works here, trained on and measured."""
     data = tmp_path / "data"
     few = ("--views", 1, "--validation", 1, "--size", 32, "--reference-spp", 4, "--workers", 1)
     (tmp_path / "no scenes").mkdir()

@@ -7,13 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from helpers.commands import write_half
 from helpers.shots import LAST, Run, arguments, outputs, write_shot
 
 from selfcorrect import Settings, exr, files
 from selfcorrect.shot import run as shot
-from selfcorrect.stages.core.network import Network
 
 
 def test_a_shot_starts_cold_and_goes_on_warm(shot_folder: Path, sequence: Run) -> None:
@@ -111,7 +109,7 @@ class TestSkipExisting:
         _, _, frames = sequence(arguments(shot_folder, "--skip-existing"))
         assert frames[2]["start"]["warm_loss"] is None
 
-    def test_a_state_of_another_making_is_not_gone_on_from(self, shot_folder: Path, sequence: Run) -> None:
+    def test_a_state_made_otherwise_is_not_continued(self, shot_folder: Path, sequence: Run) -> None:
         state = ["--save-state", shot_folder / "state.safetensors"]
         sequence(arguments(shot_folder, *state, last=2))
         write_half(shot_folder / "b.0002.exr", 777)
@@ -242,20 +240,19 @@ def test_frames_are_read_ahead_and_written_behind(shot_folder: Path, monkeypatch
         begun[job.frame].set()
         assert job.frame == LAST or read[job.frame + 1].wait(60)  # read while this frame is being worked on
         most = max(most, sum(ref() is not None for ref in alive))
-        network = Network(3, 3, Settings(), torch.Generator())
 
         def write() -> str:
             assert job.frame == LAST or begun[job.frame + 1].wait(60)  # work on the next frame goes on meanwhile
             return f"{job.frame} of {job.loaded.frame.size}"
 
-        return shot.Done(network, write)
+        return shot.Done(None, write)
 
     monkeypatch.setattr("selfcorrect.shot.run.files.load", watched)
     (shot_folder / "out").mkdir()
     names = [str(shot_folder / name) for name in ("a.####.exr", "b.####.exr", "out/x.####.exr")]
-    habits = shot.Habits(Settings(), {})
     outcomes: list[shot.Outcome] = []
-    assert shot.run(shot.Shot(*names, range(1, LAST + 1)), habits, work, outcomes.append, print) == 0
+    frames = shot.Shot(*names, range(1, LAST + 1))
+    assert shot.run(frames, shot.Options(Settings(), {}), work, outcomes.append, print) == 0
     assert [(o.frame, o.kind, o.report) for o in outcomes] == [
         (n, "written", f"{n} of (24, 30)") for n in range(1, LAST + 1)
     ]

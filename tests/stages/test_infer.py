@@ -33,7 +33,7 @@ def make_frame(height: int, width: int, seed: int = 0) -> Frame:
 
 def make_network(frame: Frame, settings: Settings) -> Network:
     half = frame.halves[0]
-    guides = Guides.of_half(half.color, half.denoised, margin=9, albedo=half.albedo)
+    guides = Guides.of_half(half._asdict(), margin=9)
     return Network.for_guides(guides, settings, torch.Generator().manual_seed(1))
 
 
@@ -61,8 +61,8 @@ def test_tiles_cover_every_pixel_once() -> None:
 def test_a_region_of_the_guides_is_the_part_of_the_whole() -> None:
     frame = make_frame(40, 50)
     half = frame.halves[0]
-    whole = Guides.of_half(half.color, half.denoised, margin=12, scale=2.0)
-    part = Guides.of_half(half.color, half.denoised, margin=5, scale=2.0, region=(0, 30, 20, 50))
+    whole = Guides.of_half(half._asdict(), margin=12, scale=2.0)
+    part = Guides.of_half(half._asdict(), margin=5, scale=2.0, region=(0, 30, 20, 50))
     assert torch.equal(part.planes[:, :30, :30], whole.planes[:, 7:37, 37:67])
 
 
@@ -84,7 +84,7 @@ def test_patches_of_crops_lie_inside_them() -> None:
     half = frame.halves[0]
     regions = [(0, 0, 40, 40), (20, 50, 60, 90), (10, 10, 50, 50)]
     settings = Settings.preset("balanced", patch=16, steps=1)
-    guides = Guides.stack([Guides.of_half(half.color, half.denoised, margin=9, region=region) for region in regions])
+    guides = Guides.stack([Guides.of_half(half._asdict(), margin=9, region=region) for region in regions])
     seen = set()
     for corners, _ in zip(batches(guides, settings, torch.Generator().manual_seed(0)), range(50), strict=False):
         for row, column in corners.tolist():

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from selfcorrect import Frame, Settings, correct
-from selfcorrect.kernel.cross_bilateral import heads_count, reference
+from selfcorrect.buffers import TERMS
+from selfcorrect.kernel.cross_bilateral import Window, heads_count, reference
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.stages.core.loss import dual_buffer_loss, learning_rate, relative_weight
 from selfcorrect.stages.core.network import Network
@@ -22,7 +23,7 @@ def full_guides(height: int = 12, width: int = 10, seed: int = 0) -> Guides:
     def buffer(channels: int) -> torch.Tensor:
         return torch.rand(height, width, channels, generator=generator)
 
-    return Guides.of_half(buffer(3), buffer(3), margin=9, albedo=buffer(3), normal=buffer(3), visibility=buffer(1))
+    return Guides.of_half({term.name: buffer(term.channels) for term in TERMS}, margin=9)
 
 
 def make_network(guides: Guides, settings: Settings = PAPER) -> Network:
@@ -75,11 +76,11 @@ def test_heads_are_nine_scales_five_bandwidths_one_centre_weight() -> None:
     guides = full_guides()
     raw = torch.randn(1, 15, 4, 4)
     heads = reference.activate(raw, guides, "eq10")
-    torch.testing.assert_close(heads.beta_z, raw[:, 0:3].tanh())
-    torch.testing.assert_close(heads.beta_albedo, raw[:, 3:6].tanh())
-    torch.testing.assert_close(heads.beta_normal, raw[:, 6:9].tanh())
-    gammas = [heads.gamma_y, heads.gamma_z, heads.gamma_albedo, heads.gamma_normal, heads.gamma_visibility]
-    for i, gamma in enumerate(gammas):
+    assert [term.name for term in heads.beta] == ["denoised", "albedo", "normal"]
+    for i, beta in enumerate(heads.beta.values()):
+        torch.testing.assert_close(beta, raw[:, 3 * i : 3 * i + 3].tanh())
+    assert [term.name for term in heads.gamma] == ["color", "denoised", "albedo", "normal", "visibility"]
+    for i, gamma in enumerate(heads.gamma.values()):
         torch.testing.assert_close(gamma, torch.log1p(raw[:, 9 + i : 10 + i].exp()))
     torch.testing.assert_close(heads.tau, torch.log1p(raw[:, 14:15].exp()))
     assert reference.EPSILON == 1e-4
@@ -88,14 +89,14 @@ def test_heads_are_nine_scales_five_bandwidths_one_centre_weight() -> None:
 def test_inputs_are_radiance_albedo_visibility_normal_denoised() -> None:
     constants = {"color": 1.0, "albedo": 2.0, "visibility": 3.0, "normal": 4.0, "denoised": 5.0}
     images = {k: torch.full((2, 2, 1 if k == "visibility" else 3), v) for k, v in constants.items()}
-    planes = Guides.of_half(images.pop("color"), images.pop("denoised"), margin=1, **images).planes
+    planes = Guides.of_half(images, margin=1).planes
     assert planes[:, 0, 0].tolist() == [1, 1, 1, 2, 2, 2, 3, 4, 4, 4, 5, 5, 5]
 
 
 @pytest.mark.parametrize(("buffers", "inputs", "heads"), [((), 6, 6), (("albedo",), 9, 10), (("normal",), 9, 10)])
 def test_absent_buffers_are_not_modelled(buffers: tuple[str, ...], inputs: int, heads: int) -> None:
     image = torch.rand(4, 4, 3)
-    guides = Guides.of_half(image, image, margin=1, **dict.fromkeys(buffers, image))
+    guides = Guides.of_half(dict.fromkeys(("color", "denoised", *buffers), image), margin=1)
     assert guides.planes.shape[0] == inputs
     assert heads_count(guides, "eq10") == heads
 
@@ -106,9 +107,9 @@ def test_eq3_fixes_the_scales() -> None:
     assert heads_count(guides, "eq3") == 6
     raw = torch.randn(1, 6, 12, 10)
     corners = torch.zeros(1, 2, dtype=torch.int64)
-    eq3 = reference.cross_bilateral(guides, raw, corners, window=3, combination="eq3")
+    eq3 = reference.cross_bilateral(guides, raw, corners, Window(3, combination="eq3"))
     saturated = torch.cat([torch.full((1, 3, 12, 10), 50.0), torch.zeros(1, 6, 12, 10), raw], 1)
-    eq10 = reference.cross_bilateral(guides, saturated, corners, window=3)
+    eq10 = reference.cross_bilateral(guides, saturated, corners, Window(3))
     torch.testing.assert_close(eq3, eq10)
 
 
@@ -128,11 +129,23 @@ def test_loss_is_eq8() -> None:
     loss = float(dual_buffer_loss(raw, corners, guides, weights, PAPER))
     terms = []
     for g_from, other, heads in ((guides[0], guides[1], raw[:2]), (guides[1], guides[0], raw[2:])):
-        g = reference.cross_bilateral(g_from, heads, corners, window=19)
+        g = reference.cross_bilateral(g_from, heads, corners, Window(19))
         cut = other.patches(corners, (8, 8))
         y, z = cut[:, :3], cut[:, -3:]
         terms.append((g - y) ** 2 / (z.mean(1, keepdim=True) ** 2 + 0.01))
     assert loss == pytest.approx(float((0.5 * (terms[0] + terms[1])).mean()), rel=1e-5)
+
+
+def test_first_bandwidths_and_names_of_the_buffers() -> None:
+    """What saved states and the residual initialisation rely on."""
+    settings = Settings.preset("paper", initialisation="residual")
+    network = make_network(full_guides(), settings)
+    assert network.traits.buffers == "color+albedo+visibility+normal+denoised"
+    beta_z, beta, gamma, tau = network.convolutions[-1].bias.detach().split([3, 6, 5, 1])
+    torch.testing.assert_close(beta_z.tanh(), torch.full((3,), 0.9))
+    assert beta.eq(0).all()
+    torch.testing.assert_close(torch.nn.functional.softplus(gamma), torch.tensor([3.0, 1.0, 0.2, 0.4, 0.2]))
+    torch.testing.assert_close(torch.nn.functional.softplus(tau), torch.tensor([0.05]))
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (64, 65), (270, 480), (360, 352), (1024, 1024)])
@@ -168,10 +181,10 @@ def test_result_is_the_clipped_mean_of_both_outputs() -> None:
     result = correct(frame, Settings.preset("paper", epochs=1))
     outputs = []
     for half in frame.halves:
-        guides = Guides.of_half(half.color, half.denoised, margin=9)
+        guides = Guides.of_half(half._asdict(), margin=9)
         origin = torch.zeros(1, 2, dtype=torch.int64)
         with torch.no_grad():
             raw = result.network(guides.patches(origin, (20, 24)))
-        outputs.append(reference.cross_bilateral(guides, raw, origin, window=19)[0].permute(1, 2, 0))
+        outputs.append(reference.cross_bilateral(guides, raw, origin, Window(19))[0].permute(1, 2, 0))
     expected = ((outputs[0] + outputs[1]) / 2).clamp(min=0)
     torch.testing.assert_close(torch.from_numpy(result.image), expected, rtol=1e-4, atol=1e-5)

@@ -61,7 +61,7 @@ def test_a_small_frame_takes_fewer_steps(size: tuple[int, int], changes: dict[st
 
 
 @pytest.mark.shared
-def test_a_small_frame_is_not_learned_by_heart(shared: Path) -> None:
+def test_a_small_frame_is_not_overfitted(shared: Path) -> None:
     """A piece of which 400 steps made an image a sixth worse, and the guard believed it three times better."""
     whole, references = load(shared / "frames", "classroom", 16)
     piece = slice(71, 199), slice(176, 304)

@@ -18,7 +18,7 @@ from selfcorrect.cli import memory
 from selfcorrect.errors import FileError, FrameError, SettingsError
 from selfcorrect.files import Sources
 from selfcorrect.frame import mean
-from selfcorrect.shot import run as shot
+from selfcorrect.shot.recipe import recipe
 from selfcorrect.stages import STAGES, opened, weights
 from selfcorrect.stages.deep_combiner import DeepCombiner, combine_whole, feature_planes
 from selfcorrect.stages.deep_combiner_4 import SubImages
@@ -402,7 +402,7 @@ def test_other_weights_are_another_recipe(renders: list[str], files: dict[str, s
     for name in ("combiner_weights", "combiner_4_weights"):
         own.write_bytes(Path(files[name]).read_bytes())
         chosen = settings({}, combiner_weights=str(own))
-        recipes.append(shot.recipe(Sources(*renders[:2]), shot.Habits(chosen, {})))
+        recipes.append(recipe(Sources(*renders[:2]), chosen, {}))
     assert recipes[0] != recipes[1]
 
 
@@ -414,7 +414,7 @@ def test_sub_images_count_as_memory(renders: list[str]) -> None:
     assert grown == [4 * image, 8 * image, 8 * image, 0]
 
 
-def test_help_tells_of_the_weights(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_the_weights(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         cli.main(["frame", "--help"])
     assert ended.value.code == 0

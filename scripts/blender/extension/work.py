@@ -15,7 +15,7 @@ RENDER_PART = 0.6  # of the time; the rest is correcting
 
 
 class WorkError(Exception):
-    """Something that the user can mend; one line."""
+    """Something that the user can fix; one line."""
 
 
 def find_command(preferences: bpy.types.AddonPreferences) -> str | None:

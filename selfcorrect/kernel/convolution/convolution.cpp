@@ -2,7 +2,7 @@
 // SELFCORRECT_CONVOLUTION names the entry. As in cross_bilateral.cpp nothing here may leak into a baseline build.
 //
 // The way forward is a wavefront: each step brings a few more rows into every layer, each layer one row behind the one
-// before. So a layer's input need not outlive them unless it is kept for the way back (then one step does all), and a
+// before. So a layer's input need not outlive them unless it is kept for the backward pass (then one step does all), and a
 // layer's weights, which do not all fit into the L1 cache at once, are fetched once for several rows. A pixel's sums
 // are in the same order wherever it lies: the result does not depend on how the image was cut.
 
@@ -89,7 +89,7 @@ void write_row(const float* line, int channels, int width, float* planes, std::i
     }
 }
 
-// The input of layer `stage`, whole for the way back or as a ring.
+// The input of layer `stage`, whole for the backward pass or as a ring.
 Rows stage_rows(const ConvolutionJob& job, int patch, int stage, int width, char* memory, char* zeros) {
     const std::int64_t row_bytes = row_pixels(width) * activation_bytes;
     if (job.kept) {

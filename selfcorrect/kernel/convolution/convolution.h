@@ -26,7 +26,7 @@ struct ConvolutionJob {
     const Image* images;   // one for each patch, all height x width; zeros around them
     int height, width;
 
-    // Every layer's input for the way back, or null: [patch][layer][row_pixels] of a row each.
+    // Every layer's input for the backward pass, or null: [patch][layer][row_pixels] of a row each.
     char* kept;
 
     float* output;                     // (patches, heads, bottom - top, right - left) of the region, contiguous

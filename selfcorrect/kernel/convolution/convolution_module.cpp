@@ -1,4 +1,4 @@
-// Python's door to the convolutions: lays weights out, cuts the work into tasks, releases the GIL. Patches (and, where
+// What Python calls for the convolutions: lays weights out, cuts the work into tasks, releases the GIL. Patches (and, where
 // nothing is kept, pieces of them) are independent, and their weights' gradients are added in the patches' order, so
 // the result does not depend on the number of threads.
 
@@ -79,7 +79,7 @@ void each_weight(int ins, int outs, bool turned, const Pair& pair) {
 
 std::int64_t parameters(int ins, int outs) { return (9 * ins + 1) * outs; }
 
-// A job with all layers' weights packed, for the way forward or turned round for the way back. `flat` holds weight and
+// A job with all layers' weights packed, for the forward pass or turned round for the backward pass. `flat` holds weight and
 // bias of each layer in turn; `widths` the channels before, between and after the layers.
 struct Network {
     std::vector<float> packed;
@@ -183,7 +183,7 @@ std::int64_t kept_bytes(const std::string& instruction_set, int patches, int lay
 
 void bind_convolution(nb::module_& m) {
     m.def("convolution_instruction_sets", &convolution_instruction_sets, "Names this processor can run, slowest first.");
-    m.def("convolution_kept_bytes", &kept_bytes, "Memory that the way back needs of the way forward.");
+    m.def("convolution_kept_bytes", &kept_bytes, "Memory that the backward pass needs of the forward pass.");
     m.def("convolution_peak",
           [](const std::string& instruction_set, std::int64_t rounds) { return variant(instruction_set).peak(rounds); },
           "Runs multiply-adds only; returns how many.");

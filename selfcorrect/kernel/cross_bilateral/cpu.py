@@ -6,21 +6,17 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from selfcorrect.buffers import TERMS
 from selfcorrect.kernel import _cpu
+from selfcorrect.kernel.backend import instruction_set
+from selfcorrect.kernel.cross_bilateral.window import Window
 from selfcorrect.kernel.guides import Guides
 
-__all__ = ["cross_bilateral", "cross_bilateral_loss", "instruction_sets"]
-
-
-def instruction_sets() -> list[str]:
-    """Names of the compiled variants that this processor can run, slowest first."""
-    return list(_cpu.instruction_sets())
+__all__ = ["cross_bilateral", "cross_bilateral_loss"]
 
 
 class _Options(NamedTuple):
-    window: int
-    every: int
-    combination: str
+    window: Window
     isa: str
     threads: int
 
@@ -28,15 +24,13 @@ class _Options(NamedTuple):
 def _arguments(guides: Guides, raw: Tensor, corners: Tensor, options: _Options) -> tuple[Any, ...]:
     return (
         guides.planes,
+        sum(1 << TERMS.index(term) for term in guides.terms),
         raw.detach(),
         (corners + guides.margin).contiguous(),
-        options.window,
-        options.every,
-        guides.has_albedo,
-        guides.has_normal,
-        guides.has_visibility,
-        options.combination == "eq3",
-        options.isa or instruction_sets()[-1],
+        options.window.side,
+        options.window.every,
+        options.window.combination == "eq3",
+        options.isa,
         options.threads,
     )
 
@@ -79,18 +73,13 @@ class _CrossBilateralLoss(torch.autograd.Function):
 
 
 def cross_bilateral(
-    guides: Guides,
-    raw: Tensor,
-    corners: Tensor,
-    *,
-    window: int,
-    every: int,
-    combination: str,
-    threads: int,
-    isa: str = "",
+    guides: Guides, raw: Tensor, corners: Tensor, window: Window, *, threads: int = 1, isa: str = ""
 ) -> Tensor:
-    """Eq. 10, like :func:`selfcorrect.kernel.cross_bilateral.reference.cross_bilateral`, for float32 on the CPU."""
-    options = _Options(window, every, combination, isa, threads)
+    """Eq. 10, like :func:`selfcorrect.kernel.cross_bilateral.reference.cross_bilateral`, for float32 on the CPU.
+
+    ``isa`` is one of :func:`selfcorrect.kernel.backend.instruction_sets`, by default the fastest.
+    """
+    options = _Options(window, instruction_set(isa), threads)
     apply: Callable[..., Tensor] = _CrossBilateral.apply  # torch leaves it untyped
     return apply(raw, guides, corners, options)
 
@@ -101,14 +90,12 @@ def cross_bilateral_loss(
     corners: Tensor,
     target: Tensor,
     weight: Tensor,
+    window: Window,
     *,
-    window: int,
-    every: int,
-    combination: str,
-    threads: int,
+    threads: int = 1,
     isa: str = "",
 ) -> Tensor:
     """One half of Eq. 8, value and gradient in one visit of each pixel."""
-    options = _Options(window, every, combination, isa, threads)
+    options = _Options(window, instruction_set(isa), threads)
     apply: Callable[..., Tensor] = _CrossBilateralLoss.apply  # torch leaves it untyped
     return apply(raw, guides, corners, target, weight, options)

@@ -1,9 +1,9 @@
-// Python's door to the kernel: checks nothing but types (__init__.py validates), releases the GIL, spreads
-// the rows over threads.
+// What Python calls: checks nothing but types (__init__.py validates), releases the GIL, spreads the rows over threads.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include "bindings.h"
 #include "job.h"
@@ -28,15 +28,14 @@ void run(const Job& job, Mode mode, const std::string& instruction_set, int thre
                           [&](std::int64_t i, float* scratch) { row(job, mode, i, scratch); });
 }
 
-Job make_job(const Array& planes, const Array& heads, const Corners& corners, int window, int every, bool albedo, bool normal,
-             bool visibility, bool eq3) {
+// The arguments that all three functions begin with.
+Job make_job(const Array& planes, unsigned present, const Array& heads, const Corners& corners, int window, int every,
+             bool eq3) {
     Job job{};
     job.planes = planes.data();
     job.plane_stride = planes.stride(0);
     job.row_stride = planes.stride(1);
-    job.has_albedo = albedo;
-    job.has_normal = normal;
-    job.has_visibility = visibility;
+    job.present = present;
     job.eq3 = eq3;
     job.window = window;
     job.every = every;
@@ -57,28 +56,34 @@ void set_gradient(Job& job, const Array& gradient) {
 }  // namespace
 
 void bind_cross_bilateral(nb::module_& m) {
+    m.def("terms", [] {
+        std::vector<std::string> names;
+        for (const Term& term : terms) names.push_back(term.name);
+        return names;
+    });
+
     m.def("forward",
-          [](Array planes, Array heads, Corners corners, int window, int every, bool albedo, bool normal, bool visibility,
-             bool eq3, const std::string& instruction_set, int threads, Array output) {
-              Job job = make_job(planes, heads, corners, window, every, albedo, normal, visibility, eq3);
+          [](Array planes, unsigned present, Array heads, Corners corners, int window, int every, bool eq3,
+             const std::string& instruction_set, int threads, Array output) {
+              Job job = make_job(planes, present, heads, corners, window, every, eq3);
               job.output = output.data();
               run(job, Mode::forward, instruction_set, threads);
           });
 
     m.def("backward",
-          [](Array planes, Array heads, Corners corners, int window, int every, bool albedo, bool normal, bool visibility,
-             bool eq3, const std::string& instruction_set, int threads, Array output_gradient, Array gradient) {
-              Job job = make_job(planes, heads, corners, window, every, albedo, normal, visibility, eq3);
+          [](Array planes, unsigned present, Array heads, Corners corners, int window, int every, bool eq3,
+             const std::string& instruction_set, int threads, Array output_gradient, Array gradient) {
+              Job job = make_job(planes, present, heads, corners, window, every, eq3);
               job.output_gradient = output_gradient.data();
               set_gradient(job, gradient);
               run(job, Mode::backward, instruction_set, threads);
           });
 
     m.def("loss",
-          [](Array planes, Array heads, Corners corners, int window, int every, bool albedo, bool normal, bool visibility,
-             bool eq3, const std::string& instruction_set, int threads, Array target, Array weight, Array gradient,
+          [](Array planes, unsigned present, Array heads, Corners corners, int window, int every, bool eq3,
+             const std::string& instruction_set, int threads, Array target, Array weight, Array gradient,
              Sums row_loss) {
-              Job job = make_job(planes, heads, corners, window, every, albedo, normal, visibility, eq3);
+              Job job = make_job(planes, present, heads, corners, window, every, eq3);
               job.target = target.data();
               job.weight = weight.data();
               job.row_loss = row_loss.data();

@@ -3,15 +3,17 @@
 
 #include <cstdint>
 
+#include "terms.h"
+
 namespace selfcorrect {
 
 enum class Mode { forward, backward, loss };
 
 struct Job {
-    // Padded guide planes, (channels, height, width): y 3, albedo 3, visibility 1, normal 3, z 3; absent ones left out.
+    // Padded guide planes, (channels, height, width), of the terms that the frame has, in the order of their places.
     const float* planes;
     std::int64_t plane_stride, row_stride;
-    bool has_albedo, has_normal, has_visibility;
+    unsigned present;  // bit m: the m-th of `terms`
     bool eq3;  // Eq. 3: beta^z = 1, no other beta; else Eq. 10
     int window;
     int every;  // taps taken: all with 1, else those of a lattice, one in `every`
@@ -35,8 +37,8 @@ struct Job {
 // Each works on patch row `row` in [0, patches * height); `scratch` holds scratch_size(window) floats.
 using RowFunction = void (*)(const Job&, Mode, std::int64_t row, float* scratch);
 
-// Weight and two logarithmic distances of every tap, at the widest vector; plus room to align.
-constexpr std::int64_t scratch_size(int window) { return 3LL * window * window * 16 + 16; }
+// What is kept of every tap, at the widest vector; plus room to align.
+constexpr std::int64_t scratch_size(int window) { return std::int64_t(most_kept) * window * window * 16 + 16; }
 
 void row_avx512(const Job&, Mode, std::int64_t, float*);
 void row_avx2(const Job&, Mode, std::int64_t, float*);

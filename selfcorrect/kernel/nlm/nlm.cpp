@@ -1,6 +1,6 @@
 // Non-local means with variance cancellation (Rousselle et al. 2012, Eqs. 3-5): one tap of the window for a strip of
 // rows at a time, so that a patch's distance is a box sum over neighbours that share the tap. Compiled once per
-// instruction set, like cross_bilateral.cpp; nlm_reference.py is the readable form.
+// instruction set, like cross_bilateral.cpp; reference.py is the readable form.
 
 #include "nlm.h"
 

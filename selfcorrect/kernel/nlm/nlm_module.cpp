@@ -1,4 +1,4 @@
-// Python's door to the non-local means: checks nothing but types (kernel/nlm.py validates), releases the GIL.
+// What Python calls for the non-local means: checks nothing but types (__init__.py validates), releases the GIL.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>

@@ -1,27 +1,25 @@
-"""Windowed first-order regression: one door to the compiled kernel (see ``regression_reference.py`` for the maths).
+"""Windowed first-order regression: validated here, computed by one of the forms beside; the maths is in reference.py.
 
-The compiled kernel's cost is that of its centres: a model for every pixel is 114 sums over 2,601 pixels at the paper's
+The compiled form's cost is that of its centres: a model for every pixel is 114 sums over 2,601 pixels at the paper's
 window. Every pixel takes the mean of all models around it, so that models at every second or fourth pixel of every
 second or fourth row (``stride``) say nearly the same for a fourth or a sixteenth of the time.
 """
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
-from selfcorrect.image.exposure import LARGEST
-from selfcorrect.image.windows import reflect
-from selfcorrect.kernel import _cpu, nlm
-from selfcorrect.kernel.cross_bilateral.cpu import instruction_sets
+from selfcorrect.kernel.backend import choose
+from selfcorrect.kernel.nlm import Strip
+from selfcorrect.kernel.regression import cpu, reference
 
 __all__ = ["regress", "regress_non_local"]
 
 LARGEST_WINDOW = 63
-_LANES = 16  # the widest vector reads up to this many cells beyond the last one
+_DTYPES = (torch.float16, torch.float32, torch.float64)
 
 
 def regress(
@@ -33,7 +31,7 @@ def regress(
     bandwidth: float,
     stride: int = 1,
     threads: int = 1,
-    isa: str = "",
+    backend: str | None = None,
 ) -> Tensor:
     """Targets as a first-order function of features, fitted by weighted least squares in every window.
 
@@ -48,15 +46,15 @@ def regress(
         ridge: added to the diagonal of the scaled system, whose weights sum to 1; > 0.
         bandwidth: > 0.
         stride: models are solved at every stride-th pixel of every stride-th row, 1 … 16 and at most the window.
-        threads: of the compiled kernel.
-        isa: one of :func:`selfcorrect.kernel.cross_bilateral.cpu.instruction_sets`; by default the widest.
+        threads: of the compiled form.
+        backend: as for :func:`selfcorrect.kernel.backend.choose`; the reference holds every window at once.
 
     Returns:
-        (H, W, 3) float32.
+        (H, W, 3), float32 from the compiled form.
 
     Raises:
         FrameError: shapes do not fit.
-        SettingsError: a number is out of range.
+        SettingsError: a number is out of range, or no such backend for these tensors.
     """
     if window % 2 == 0 or not 1 <= window <= LARGEST_WINDOW:
         raise SettingsError(f"expected an odd window from 1 to {LARGEST_WINDOW}, but got {window}")
@@ -65,109 +63,41 @@ def regress(
             f"expected a stride from 1 to 16 and to the window, a ridge > 0 and a bandwidth > 0, "
             f"but got {stride}, {ridge}, {bandwidth}"
         )
-    layout = Layout.of(features, targets, window // 2, stride)
-    inverse = 1 / (bandwidth * math.log(2))
-    options = (ridge, inverse, None, 0, layout.height, isa or instruction_sets()[-1], threads)
-    models = torch.empty(3 * (layout.features + 1), layout.height, layout.width)
-    _cpu.solve(*layout.arguments, *options, models)
-    output = torch.empty(stride * stride, 3, layout.height, layout.width)
-    _cpu.reconstruct(*layout.arguments, *options, layout.centres(models), output)
-    return layout.image(output)
+    _check_shapes(features, targets)
+    if choose(backend, [*features, targets], dtypes=_DTYPES) == "reference":
+        return reference.regress(features, targets, window=window, ridge=ridge, bandwidth=bandwidth, stride=stride)
+    return cpu.regress(
+        features, targets, window=window, ridge=ridge, bandwidth=bandwidth, stride=stride, threads=threads
+    )
 
 
 def regress_non_local(
     features: list[Tensor],
     targets: Tensor,
-    weights: Callable[[], Iterable[nlm.Strip]],
+    weights: Callable[[], Iterable[Strip]],
     *,
     radius: int,
     ridge: float,
     threads: int = 1,
-    isa: str = "",
 ) -> Tensor:
-    """As :func:`regress` with a model at every pixel, but with given weights, those of non-local means.
+    """As :func:`regress` with a model at every pixel, but with given weights, those of non-local means; compiled.
 
     Args:
         features: as for :func:`regress`.
         targets: (H, W, 3).
         weights: gives :func:`selfcorrect.kernel.nlm.strips` of this radius; called twice.
         radius: of the window.
-        ridge, threads, isa: as for :func:`regress`.
+        ridge, threads: as for :func:`regress`.
     """
-    layout = Layout.of(features, targets, radius, 1)
-    models = torch.empty(3 * (layout.features + 1), layout.height, layout.width)
-    output = torch.empty(1, 3, layout.height, layout.width)
-
-    def each(function: Callable[..., None], *arrays: Tensor) -> None:
-        for strip in weights():
-            options = (ridge, 0.0, strip.weights, strip.first_row, strip.weights.shape[1])
-            function(*layout.arguments, *options, isa or instruction_sets()[-1], threads, *arrays)
-
-    each(_cpu.solve, models)
-    each(_cpu.reconstruct, layout.centres(models), output)
-    return layout.image(output)
+    _check_shapes(features, targets)
+    return cpu.regress_non_local(features, targets, weights, radius=radius, ridge=ridge, threads=threads)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Features and targets in planes padded by mirroring, cut into cells of stride × stride pixels.
-
-    ``planes`` is (stride², channels, rows, columns): place in the cell, then cells. The first place is the centres'.
-    """
-
-    planes: Tensor
-    size: tuple[int, int]
-    vectors: int
-    scalars: int
-    radius: int
-    stride: int
-    margin: int  # cells
-    height: int  # cells
-    width: int  # cells
-
-    @classmethod
-    def of(cls, features: list[Tensor], targets: Tensor, radius: int, stride: int) -> "Layout":
-        """Check the buffers, bound them by ±1e15, and lay them out."""
-        height, width = targets.shape[:2]
-        channels = [feature.shape[2] for feature in features]
-        vectors, scalars = channels.count(3), channels.count(1)
-        known = channels == [3] * vectors + [1] * scalars and vectors <= 3 and scalars <= 2
-        fitting = all(feature.shape[:2] == (height, width) for feature in features)
-        if not features or not known or not fitting or targets.shape[2] != 3:
-            shapes = ", ".join(str(tuple(image.shape)) for image in (*features, targets))
-            raise FrameError(f"expected features (H, W, 3), then (H, W, 1), and targets (H, W, 3), but got {shapes}")
-        stacked = torch.cat([*features, targets], 2).float().clamp(-LARGEST, LARGEST).permute(2, 0, 1)
-        margin = -(-radius // stride)
-        cells = (-(-height // stride), -(-width // stride))
-        rows = reflect(-margin * stride, (cells[0] + margin) * stride, height)
-        columns = reflect(-margin * stride, (cells[1] + margin + _LANES) * stride, width)
-        padded = stacked.index_select(1, rows).index_select(2, columns)
-        cut = padded.unflatten(2, (-1, stride)).unflatten(1, (-1, stride))  # (C, rows, stride, columns, stride)
-        planes = cut.permute(2, 4, 0, 1, 3).flatten(0, 1).contiguous()
-        return cls(planes, (height, width), vectors, scalars, radius, stride, margin, *cells)
-
-    @property
-    def features(self) -> int:
-        """Number of features, without the constant."""
-        return 3 * self.vectors + self.scalars
-
-    @property
-    def arguments(self) -> tuple[object, ...]:
-        """What the compiled functions take first."""
-        return (
-            *(self.planes, self.vectors, self.scalars),
-            *(self.radius, self.stride, self.margin, self.height, self.width),
-        )
-
-    def centres(self, models: Tensor) -> Tensor:
-        """Models (planes, height, width) and their centres' features, the grid mirrored by the margin."""
-        m = self.margin
-        own = self.planes[0, : self.features, m : m + self.height, m : m + self.width]
-        rows, columns = reflect(-m, self.height + m, self.height), reflect(-m, self.width + m + _LANES, self.width)
-        return torch.cat([models, own]).index_select(1, rows).index_select(2, columns).contiguous()
-
-    def image(self, output: Tensor) -> Tensor:
-        """The kernel's output as an image (H, W, 3)."""
-        s = self.stride
-        whole = output.reshape(s, s, 3, self.height, self.width).permute(3, 0, 4, 1, 2)
-        return whole.reshape(self.height * s, self.width * s, 3)[: self.size[0], : self.size[1]].contiguous()
+def _check_shapes(features: list[Tensor], targets: Tensor) -> None:
+    channels = [feature.shape[2] for feature in features]
+    vectors, scalars = channels.count(3), channels.count(1)
+    known = channels == [3] * vectors + [1] * scalars and vectors <= 3 and scalars <= 2
+    fitting = all(feature.shape[:2] == targets.shape[:2] for feature in features)
+    if not features or not known or not fitting or targets.shape[2] != 3:
+        shapes = ", ".join(str(tuple(image.shape)) for image in (*features, targets))
+        raise FrameError(f"expected features (H, W, 3), then (H, W, 1), and targets (H, W, 3), but got {shapes}")

@@ -1,7 +1,7 @@
 // Weighted least squares in the window of every centre, and every pixel's mean over the models around it
 // (Gu et al. 2022, Eqs. 10-12; Bitterli et al. 2016). Compiled once per instruction set. Everything is in an anonymous
 // namespace and uses no standard template, so that no wide instruction can leak into a baseline build.
-// regression_reference.py is the readable form.
+// reference.py is the readable form.
 
 #include "regression.h"
 

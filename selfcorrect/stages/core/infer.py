@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
+from selfcorrect.buffers import DENOISED
 from selfcorrect.frame import Half
 from selfcorrect.image.tiles import Region, tiles
-from selfcorrect.kernel.cross_bilateral import cross_bilateral
+from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.network import Network
@@ -55,35 +56,21 @@ def infer_tile(
     denoised: Tensor | None = None,
 ) -> Tensor:
     """One region (top, left, bottom, right) of what :func:`infer` gives."""
-    shown = half.denoised if denoised is None else denoised
-    assert shown is not None  # correct() has checked; tells the type checker
+    buffers: dict[str, Tensor | None] = half._asdict()
+    if denoised is not None:
+        buffers[DENOISED.name] = denoised
     height, width, _ = half.color.shape
     top, left, bottom, right = region
     reach = settings.layers  # zeros are padded at the image's border alone
     above, before = min(reach, top), min(reach, left)
     below, after = min(reach, height - bottom), min(reach, width - right)
-    guides = Guides.of_half(
-        half.color,
-        shown,
-        margin=max(settings.window // 2, reach),
-        albedo=half.albedo,
-        normal=half.normal,
-        visibility=half.visibility,
-        scale=scale,
-        region=region,
-    )
+    window = Window.of(settings).whole
+    guides = Guides.of_half(buffers, margin=max(window.radius, reach), scale=scale, region=region)
     origin = torch.zeros(1, 2, dtype=torch.int64)
     around = (above + guides.height + below, before + guides.width + after)
     raw = network(
         guides.views(origin - torch.tensor([[above, before]]), around),
         region=(above, before, above + guides.height, before + guides.width),
     )
-    g = cross_bilateral(
-        guides,
-        raw,
-        origin,
-        window=settings.window,
-        combination=settings.combination,
-        threads=torch.get_num_threads(),
-    )
+    g = cross_bilateral(guides, raw, origin, window, threads=torch.get_num_threads())
     return g[0].permute(1, 2, 0)

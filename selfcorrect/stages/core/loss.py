@@ -5,7 +5,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from selfcorrect.kernel.cross_bilateral import cross_bilateral_loss
+from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral_loss
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.settings import Settings
 
@@ -38,9 +38,7 @@ def dual_buffer_loss(
     raw_a, raw_b = raw.chunk(2)
     one_way = partial(
         cross_bilateral_loss,
-        window=settings.window,
-        every=settings.taps_every,
-        combination=settings.combination,
+        window=Window.of(settings),
         threads=torch.get_num_threads(),
     )
     return one_way(a, raw_a, corners, b.radiance, weights[1]) + one_way(b, raw_b, corners, a.radiance, weights[0])

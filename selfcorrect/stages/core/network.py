@@ -1,14 +1,14 @@
 """The network of Back et al. 2022: nine 3×3 convolutions, 20,303 parameters with all thirteen inputs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
+from selfcorrect.buffers import DENOISED, INPUTS, Buffer
 from selfcorrect.errors import FrameError
 from selfcorrect.kernel import convolution
 from selfcorrect.kernel.cross_bilateral import heads_count
@@ -18,21 +18,21 @@ from selfcorrect.settings import Settings
 __all__ = ["Network", "Traits", "buffer_names"]
 
 # What the residual initialisation's heads start at: g is close to z_c plus the mean of y_i − z_i over pixels like c,
-# with wide bandwidths in the noisy radiance and narrow ones in the buffers that have little noise.
+# with the bandwidths of the table of buffers: wide in the noisy radiance, narrow where there is little noise.
 _START_BETA_Z = 0.9
-_START_GAMMA = {"y": 3.0, "z": 1.0, "albedo": 0.2, "normal": 0.4, "visibility": 0.2}
 _START_TAU = 0.05
 _START_SPREAD = 0.1  # of the last layer's weights: heads start near the same value everywhere
 
 
-def buffer_names(*, albedo: bool, visibility: bool, normal: bool) -> str:
-    """What a network sees, in the order of its inputs.
+def buffer_names(terms: Iterable[Buffer]) -> str:
+    """What a network sees of these, in the order of its inputs.
 
-    >>> buffer_names(albedo=True, visibility=False, normal=True)
+    >>> from selfcorrect.buffers import TERMS
+    >>> buffer_names(term for term in TERMS if term.name != "visibility")
     'color+albedo+normal+denoised'
     """
-    there = {"color": True, "albedo": albedo, "visibility": visibility, "normal": normal, "denoised": True}
-    return "+".join(name for name, is_there in there.items() if is_there)
+    there = set(terms)
+    return "+".join(term.name for term in INPUTS if term in there)
 
 
 class Traits(NamedTuple):
@@ -58,9 +58,8 @@ class Traits(NamedTuple):
     @classmethod
     def of(cls, guides: Guides, settings: Settings) -> "Traits":
         """The traits of the network that these guides and settings ask for."""
-        buffers = buffer_names(albedo=guides.has_albedo, visibility=guides.has_visibility, normal=guides.has_normal)
         own = [getattr(settings, name) for name in cls._fields[1:]]
-        return cls(buffers, *own)
+        return cls(buffer_names(guides.terms), *own)
 
     def check(self, given: "Traits") -> None:
         """Raise a FrameError that names the first trait in which ``given`` differs."""
@@ -77,7 +76,7 @@ class Traits(NamedTuple):
 
 
 class _Convolution(nn.Module):
-    """3×3 with zero padding. torch's own would draw its first weights from the caller's random numbers."""
+    """Weights of a 3×3 convolution. torch's own would draw the first ones from the caller's random numbers."""
 
     def __init__(self, inputs: int, outputs: int, generator: torch.Generator):
         super().__init__()
@@ -85,17 +84,13 @@ class _Convolution(nn.Module):
         self.bias = nn.Parameter(torch.zeros(outputs))
         nn.init.xavier_uniform_(self.weight, generator=generator)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, inputs, h, w) to (N, outputs, h, w)."""
-        return F.conv2d(x, self.weight, self.bias, padding=1)
-
 
 class Network(nn.Module):
     """Convolutions 3×3 with ReLU between them, zero padding, Glorot-uniform weights and zero biases.
 
     Args:
         inputs: channels of the guides, radiance first and denoised radiance last.
-        heads: raw outputs per pixel, see :func:`selfcorrect.kernel.heads_count`.
+        heads: raw outputs per pixel, see :func:`selfcorrect.kernel.cross_bilateral.heads_count`.
         settings: ``filters``, ``layers``, ``log_radiance``, ``precision``.
         generator: source of the first weights.
 
@@ -126,9 +121,9 @@ class Network(nn.Module):
         return network
 
     def _start_at_residual(self, guides: Guides, combination: str) -> None:
-        betas = [math.atanh(_START_BETA_Z)] * 3 + [0.0] * (guides.betas - 3) if combination == "eq10" else []
-        present = {"albedo": guides.has_albedo, "normal": guides.has_normal, "visibility": guides.has_visibility}
-        gammas = [value for name, value in _START_GAMMA.items() if present.get(name, True)]
+        scaled = guides.scaled if combination == "eq10" else ()
+        betas = [math.atanh(_START_BETA_Z) if term == DENOISED else 0.0 for term in scaled for _ in range(3)]
+        gammas = [term.first_bandwidth for term in guides.terms]
         last = self.convolutions[-1]
         assert isinstance(last, _Convolution)
         with torch.no_grad():
@@ -136,34 +131,12 @@ class Network(nn.Module):
             last.bias.copy_(torch.tensor([*betas, *(math.log(math.expm1(value)) for value in (*gammas, _START_TAU))]))
 
     def forward(self, guides: Tensor | Sequence[Tensor], region: tuple[int, int, int, int] | None = None) -> Tensor:
-        """Guides, N of (C, h, w), to raw heads (N, heads, h, w), or those of a region (top, left, bottom, right).
-
-        On the CPU by the compiled kernel, see :func:`selfcorrect.kernel.convolution.convolutions`.
-        """
-        parameters = list(self.parameters())
-        if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*guides, *parameters)) and (
-            max(p.shape[0] for p in (guides[0], *parameters)) <= convolution.LARGEST_WIDTH
-        ):
-            return convolution.convolutions(
-                list(guides),
-                parameters,
-                log_radiance=self.log_radiance,
-                region=region,
-                precision=self.precision,
-                threads=torch.get_num_threads(),
-            )
-        raw = self.reference(guides if isinstance(guides, Tensor) else torch.stack(list(guides)))
-        top, left, bottom, right = region or (0, 0, *raw.shape[2:])
-        return raw[:, :, top:bottom, left:right]
-
-    def reference(self, guides: Tensor) -> Tensor:
-        """The same in plain torch: guides (N, C, h, w), any device and dtype."""
-        x = guides
-        if self.log_radiance:
-            x = torch.cat([x[:, :3].log1p(), x[:, 3:-3], x[:, -3:].log1p()], 1)
-        x = x.contiguous(memory_format=torch.channels_last)
-        *hidden, last = self.convolutions
-        for layer in hidden:
-            x = torch.relu_(layer(x))
-        raw: Tensor = last(x)
-        return raw
+        """Guides, N of (C, h, w), to raw heads (N, heads, h, w), or those of a region (top, left, bottom, right)."""
+        return convolution.convolutions(
+            list(guides),
+            list(self.parameters()),
+            log_radiance=self.log_radiance,
+            region=region,
+            precision=self.precision,
+            threads=torch.get_num_threads(),
+        )

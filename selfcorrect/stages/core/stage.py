@@ -10,6 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from selfcorrect.buffers import DENOISED
 from selfcorrect.frame import Half, mean
 from selfcorrect.image.bands import bands
 from selfcorrect.image.exposure import Scaled, scale_
@@ -89,16 +90,8 @@ def _training_guides(state: StageImages, settings: Settings, generator: torch.Ge
         margin += max(overhang(size, s) for s in (settings, _warm(settings)))
 
     def one(half: Half, denoised: Tensor) -> Guides:
-        cut = partial(
-            Guides.of_half,
-            half.color,
-            denoised,
-            margin=margin,
-            albedo=half.albedo,
-            normal=half.normal,
-            visibility=half.visibility,
-            scale=state.scale,
-        )
+        buffers = half._asdict() | {DENOISED.name: denoised}
+        cut = partial(Guides.of_half, buffers, margin=margin, scale=state.scale)
         return Guides.stack([cut(region=region) for region in regions]) if regions else cut()
 
     return one(state.halves[0], state.images[0]), one(state.halves[1], state.images[1])

@@ -1,0 +1,43 @@
+"""The command `compare`: the error of an image against one or two references."""
+
+import argparse
+import math
+from typing import Any
+
+from selfcorrect import exr, metrics
+from selfcorrect.cli.terminal import answer
+from selfcorrect.errors import FrameError
+
+__all__ = ["add"]
+
+
+def add(commands: Any) -> None:
+    """Add the command to argparse's subparsers."""
+    parser = commands.add_parser("compare", help="error of an image against one or two references")
+    parser.add_argument("image", metavar="IMAGE.exr")
+    parser.add_argument("reference", metavar="REF.exr")
+    parser.add_argument("reference_b", metavar="REF2.exr", nargs="?", help="an independent second reference")
+    parser.add_argument("--weight", metavar="SMOOTH.exr", help="smooth reference for the weight of relMSE")
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.set_defaults(run=_compare)
+
+
+def _compare(options: argparse.Namespace) -> None:
+    image, reference = (exr.load_half(path).buffers["color"] for path in (options.image, options.reference))
+    reference_b, weight = (
+        None if path is None else exr.load_half(path).buffers["color"] for path in (options.reference_b, options.weight)
+    )
+    try:
+        result = metrics.compare(image, reference, reference_b, weight, seed=options.seed)
+    except FrameError as error:
+        raise FrameError(f"{options.image}: {error}") from None
+    if options.json:
+        # JSON has no infinity (the PSNR of equal images) and no NaN (the standard error of one tile)
+        answer({name: value if math.isfinite(value) else None for name, value in vars(result).items()})
+        return
+    print(f"relMSE               {result.relmse:.6g} ± {result.relmse_standard_error:.2g}")
+    print(f"PSNR (tone-mapped)   {result.psnr:.2f} dB")
+    print(f"SSIM (tone-mapped)   {result.ssim:.4f}")
+    print(f"FLIP                 {result.flip:.4f}")
+    print(f"mean radiance ratio  {result.mean_radiance_ratio:.4f}")

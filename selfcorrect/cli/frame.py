@@ -1,0 +1,69 @@
+"""The command `frame`: one frame, from files to file."""
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any
+
+from selfcorrect import exr, files
+from selfcorrect.cli import flags, memory, pages
+from selfcorrect.cli.runner import Runner
+from selfcorrect.cli.terminal import EndOnInterrupt, answer
+from selfcorrect.facts import Written
+from selfcorrect.frame import Frame
+from selfcorrect.publish import remove_abandoned
+
+__all__ = ["add", "correct_files"]
+
+
+def add(commands: Any) -> None:
+    """Add the command to argparse's subparsers."""
+    parser = commands.add_parser("frame", help="correct one frame")
+    flags.add_halves(parser)
+    flags.add_extra(parser)
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.exr")
+    parser.add_argument(
+        "--maxmem",
+        metavar="SIZE",
+        help="most memory to take, such as 6G; a frame that does not fit is refused at once. OIDN works in what is "
+        "left, with the same result; other denoisers are not held to it",
+    )
+    pages.add_flag(parser)
+    flags.add_run_flags(parser)
+    parser.set_defaults(run=_frame)
+
+
+def _frame(options: argparse.Namespace) -> None:
+    sources = files.Sources(options.a, options.b, **flags.denoised(options), mapping=flags.mapping(options))
+    page = pages.FramePage.at(options.report)
+    gather = None if page is None else page.gather
+    written = correct_files(options, sources, options.output, maxmem=options.maxmem, gather=gather)
+    if page is not None:
+        page.write(written.to_dict())
+    if options.json:
+        answer(written.to_dict())
+
+
+def correct_files(
+    options: argparse.Namespace,
+    sources: files.Sources,
+    output: str,
+    *,
+    maxmem: str | None = None,
+    show: Callable[[Frame], None] | None = None,
+    gather: pages.Gather | None = None,
+) -> Written:
+    """Correct one frame from files to file; ``show`` is called with the denoised frame, ``gather`` with it and the
+    result.
+    """
+    start = time.perf_counter()
+    scratch = None
+    if maxmem is not None:
+        size, settings = memory.parse_size(maxmem), flags.settings_of(options)
+        extra = sum(len(paths) for paths in flags.extra_files(options, settings).values())
+        scratch = memory.scratch_within(size, sources, settings, extra=extra)
+    runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
+    remove_abandoned(exr.check_target(output).parent)
+    with EndOnInterrupt() as stop:
+        corrected = runner.correct(files.load(sources), began=start, show=show, stop=stop, gather=gather)
+        return runner.write(output, corrected)

@@ -1,0 +1,157 @@
+"""Pages to look at (:mod:`selfcorrect.report`), gathered while frames are in memory."""
+
+import argparse
+import contextlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from selfcorrect import exr, report
+from selfcorrect.correct import Result
+from selfcorrect.errors import SelfcorrectError
+from selfcorrect.frame import Frame, mean
+from selfcorrect.guard import Estimate
+from selfcorrect.publish import publish
+from selfcorrect.report.shot import looked_at
+from selfcorrect.settings import Settings
+from selfcorrect.shot.run import Outcome
+
+__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "add_flag", "facts_of", "target", "write"]
+
+MAPS = ("error.before", "error.after", "blend")
+"""Of a result's maps, in the order of the page."""
+
+Gather = Callable[[Frame, Result], None]
+"""Called with a denoised frame and what was made of it."""
+
+
+def add_flag(parser: argparse.ArgumentParser) -> None:
+    """The flag --report."""
+    parser.add_argument("--report", metavar="PAGE.html", help="also write a page to look at, for any browser")
+
+
+def target(path: str | None) -> Path | None:
+    """The page to write, or None of none; to be called before long work.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    return None if path is None else exr.check_target(path, ".html")
+
+
+def write(page: Path, text: str) -> None:
+    """Write a page; an older one survives any failure."""
+    publish(page, text.encode())
+
+
+def facts_of(file: exr.ExrFile) -> dict[str, Any]:
+    """What an output of selfcorrect tells of how it was made; of another file nothing. Values of a wrong kind are left
+    out: anyone may have written the attributes.
+    """
+    header = file.parts[0].header
+    run, settings = (_object(header.get(f"selfcorrect/{name}")) for name in ("run", "settings"))
+    facts: dict[str, Any] = {
+        name: run[name] for name in ("preset", "denoiser", "version") if isinstance(run.get(name), str)
+    }
+    facts["estimate"] = _estimate(run.get("estimate"))
+    with contextlib.suppress(SelfcorrectError):
+        facts["settings"] = Settings.from_dict(settings).to_dict() if settings else None
+    return facts
+
+
+def _object(text: Any) -> dict[str, Any]:
+    try:
+        found = json.loads(text or "{}")
+    except (TypeError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _estimate(found: Any) -> dict[str, Any] | None:
+    names = [f.name for f in fields(Estimate)]
+    if not isinstance(found, dict) or not all(isinstance(found.get(name), (int, float)) for name in names):
+        return None
+    return {name: found[name] for name in names}
+
+
+def _images(frame: Frame, corrected: Any) -> dict[str, Any]:
+    denoised = frame.candidates[0].full
+    return {"noisy": mean(frame.color), "denoised": denoised, "corrected": corrected}
+
+
+class FramePage:
+    """The page of one frame; what is kept for it is small enough to stand beside any frame in memory."""
+
+    def __init__(self, page: Path):
+        self._page = page
+        self._images: dict[str, Any] = {}
+        self._maps: dict[str, Any] = {}
+
+    @classmethod
+    def at(cls, path: str | None) -> "FramePage | None":
+        """A page to be written here, or None where there is to be none."""
+        page = target(path)
+        return None if page is None else cls(page)
+
+    def gather(self, frame: Frame, result: Result) -> None:
+        """Keep what is to be looked at."""
+        self._images = {name: report.shrunk(image) for name, image in _images(frame, result.image).items()}
+        self._maps = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
+
+    def write(self, facts: Mapping[str, Any]) -> None:
+        """Write the page; ``facts`` are what --json prints."""
+        title = Path(facts["output"]).name
+        write(self._page, report.frame_page(self._images, self._maps, {**facts, "title": title}))
+
+
+class ShotPage:
+    """The page of a shot, gathered frame by frame."""
+
+    def __init__(self, page: Path, numbers: Sequence[int]):
+        self._page = page
+        self._kept = looked_at(numbers)
+        self._pictures: dict[int, dict[str, Any]] = {}
+        self._frames: list[report.ShotFrame] = []
+
+    @classmethod
+    def at(cls, path: str | None, numbers: Sequence[int]) -> "ShotPage | None":
+        """A page to be written here, or None where there is to be none."""
+        page = target(path)
+        return None if page is None else cls(page, numbers)
+
+    def gather(self, number: int) -> Gather:
+        """What keeps a frame of this number."""
+
+        def keep(frame: Frame, result: Result) -> None:
+            images = _images(frame, result.image)
+            kept: dict[str, Any] = {
+                "thumbnail": report.thumbnail(images["corrected"]),
+                "rows": {name: report.slice_of(image) for name, image in images.items()},
+            }
+            if number in self._kept:
+                kept["images"] = {name: report.shrunk(image) for name, image in images.items()}
+                kept["maps"] = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
+            self._pictures[number] = kept
+
+        return keep
+
+    def told(self, outcome: Outcome) -> None:
+        """Keep what became of a frame."""
+        pictures = self._pictures.pop(outcome.frame, {}) if outcome.kind == "written" else {}
+        facts = {"reason": outcome.reason} if outcome.report is None else outcome.report.to_dict()
+        if outcome.kind == "skipped":
+            with contextlib.suppress(SelfcorrectError):  # the page is no reason to fail
+                half = exr.load_half(outcome.output)
+                color = half.buffers["color"]
+                facts |= facts_of(half.file)
+                pictures = {"thumbnail": report.thumbnail(color), "rows": {"corrected": report.slice_of(color)}}
+        self._frames.append(report.ShotFrame(outcome.frame, outcome.kind, facts, **pictures))
+
+    def write(self, title: str, settings: Settings, more: Mapping[str, Any]) -> None:
+        """Write the page, of the frames there are; ``more`` is what all of them share."""
+        written = [frame.facts for frame in self._frames if frame.outcome == "written"]
+        shared = {name: written[0][name] for name in ("channels", "threads", "version") if written}
+        facts = {"title": Path(title).name, "settings": settings.to_dict(), **shared, **more}
+        write(self._page, report.shot_page(self._frames, facts))

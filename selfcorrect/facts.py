@@ -1,0 +1,190 @@
+"""The facts of a run, gathered once: the log, ``--json`` and the output's attributes all read them. Prints nothing."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+import torch
+
+from selfcorrect.correct import Result
+from selfcorrect.frame import Frame
+from selfcorrect.guard import Estimate
+from selfcorrect.image.repair import Repairs
+from selfcorrect.settings import Settings
+from selfcorrect.stages.stage import Start
+
+__all__ = ["Corrected", "Denoised", "Written", "channel_lines"]
+
+
+def channel_lines(channels: Mapping[str, list[str]]) -> list[str]:
+    """What was taken for what, for the log."""
+    return [f"{role}: {', '.join(names)}" for role, names in channels.items()]
+
+
+@dataclass(frozen=True)
+class Denoised:
+    """What is known of a frame before it is corrected.
+
+    Attributes:
+        denoiser: who denoised it; ``given`` where the files hold denoised halves.
+        channels: role → channels that were taken for it.
+        size: height and width in pixels.
+        repairs: by buffer, how many pixels were changed on the way in.
+        constant: the G-buffers that are the same at every pixel, and not used.
+        seconds: of reading and denoising.
+    """
+
+    denoiser: str
+    channels: Mapping[str, list[str]]
+    size: tuple[int, int]
+    repairs: Mapping[str, Repairs]
+    constant: list[str]
+    seconds: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls,
+        frame: Frame,
+        denoiser: str,
+        channels: Mapping[str, list[str]],
+        seconds: Mapping[str, float],
+        repairs: Mapping[str, Repairs],
+    ) -> "Denoised":
+        """Those of a denoised frame; ``repairs`` are those of images beyond its buffers."""
+        return cls(denoiser, channels, frame.size, {**frame.repairs, **repairs}, list(frame.constant), dict(seconds))
+
+    def lines(self) -> list[str]:
+        """For the log: what was not used, and what was repaired."""
+        unused = [f"{name}: the same at every pixel; not used" for name in self.constant]
+        repaired = [
+            f"{name}: {counts.non_finite} pixels were NaN or infinite, {counts.negative} negative; repaired"
+            for name, counts in self.repairs.items()
+            if any(counts)
+        ]
+        return unused + repaired
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """What is known of a frame once it is corrected.
+
+    Attributes:
+        before: of the frame as it was denoised.
+        preset: the name that the settings came from.
+        settings: of the correction, as they were asked for.
+        estimate: what the guard says was gained; None where it is off.
+        start: what training began from.
+        seconds: of each stage.
+        input_scale: what radiance was multiplied by.
+        steps: of the optimiser.
+        parameters: of the network; 0 without one.
+        threads: of the CPU.
+        more: what else belongs into the attributes, by name: plain values.
+        version: of selfcorrect.
+    """
+
+    before: Denoised
+    preset: str
+    settings: Settings
+    estimate: Estimate | None
+    start: Start
+    seconds: Mapping[str, float]
+    input_scale: float
+    steps: int
+    parameters: int
+    threads: int
+    more: Mapping[str, Any] = field(default_factory=dict)
+    version: str = field(default_factory=lambda: version("selfcorrect"))
+
+    @classmethod
+    def of(
+        cls, before: Denoised, result: Result, preset: str, settings: Settings, more: Mapping[str, Any] | None = None
+    ) -> "Corrected":
+        """Those of a result that was computed on torch's present number of threads."""
+        return cls(
+            before=before,
+            preset=preset,
+            settings=settings,
+            estimate=result.estimate,
+            start=result.start,
+            seconds=dict(result.seconds),
+            input_scale=result.input_scale,
+            steps=len(result.losses),
+            parameters=0 if result.network is None else sum(p.numel() for p in result.network.parameters()),
+            threads=torch.get_num_threads(),
+            more=dict(more or {}),
+        )
+
+    def start_line(self) -> str:
+        """What a frame of a shot started from, for the log."""
+        start = self.start
+        if start.warm_loss is None:
+            return "started cold"
+        how = "started warm" if start.warm else "did not look like the frame before: started cold"
+        return f"{how} (loss before training {start.warm_loss:.5g} warm, {start.cold_loss:.5g} cold)"
+
+    def attributes(self) -> dict[str, str]:
+        """For the output file: by name, JSON."""
+        return {
+            "selfcorrect/settings": json.dumps(self.settings.to_dict()),
+            "selfcorrect/run": json.dumps(self.run()),
+        }
+
+    def run(self) -> dict[str, Any]:
+        """How the output was made, beside its settings: plain values."""
+        return {
+            "preset": self.preset,
+            "denoiser": self.before.denoiser,
+            "version": self.version,
+            "estimate": None if self.estimate is None else asdict(self.estimate),
+            "start": self.start._asdict(),
+            **self.more,
+        }
+
+
+@dataclass(frozen=True)
+class Written:
+    """What is known of a frame once its output is written: everything.
+
+    Attributes:
+        output: the file.
+        clipped: how many values lay beyond the range of half floats.
+        seconds: of writing, and in total.
+        corrected: what was known before.
+    """
+
+    output: str
+    clipped: int
+    seconds: Mapping[str, float]
+    corrected: Corrected
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        facts, before = self.corrected, self.corrected.before
+        seconds = {**before.seconds, **facts.seconds, **self.seconds}
+        height, width = before.size
+        return {
+            "output": self.output,
+            "settings": facts.settings.to_dict(),
+            **facts.run(),
+            "channels": dict(before.channels),
+            "seconds": {name: round(value, 3) for name, value in seconds.items()},
+            "size": {"width": width, "height": height},
+            "repairs": {name: counts._asdict() for name, counts in before.repairs.items()},
+            "constant": before.constant,
+            "input_scale": facts.input_scale,
+            "steps": facts.steps,
+            "parameters": facts.parameters,
+            "threads": facts.threads,
+        }
+
+    def lines(self) -> list[str]:
+        """For the log: what was gained, what was clipped, and how long it took."""
+        estimate = self.corrected.estimate
+        lines = [] if estimate is None else [str(estimate)]
+        if self.clipped:
+            lines.append(f"{self.output}: {self.clipped} values beyond the range of half floats were clipped")
+        spent = ", ".join(f"{name} {value:.1f} s" for name, value in self.corrected.seconds.items())
+        return [*lines, f"{self.output}: written after {self.seconds['total']:.1f} s ({spent})"]

@@ -1,0 +1,103 @@
+"""The rule of the house: data walks one way, and only the command prints."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import selfcorrect
+
+PACKAGE = Path(selfcorrect.__file__).parent
+ORDER = (
+    {"errors", "publish", "buffers", "settings"},
+    {"image"},
+    {"kernel"},
+    {"frame", "exr"},
+    {"stages"},
+    {"guard", "independence", "metrics"},
+    {"correct"},
+    {"files", "facts"},
+    {"shot", "tradeoff"},
+    {"cli"},
+)
+"""The rooms, the lowest first; those of one level know nothing of each other, but for the lowest level."""
+
+LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
+MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
+OUTSIDE = {Path("__init__.py"), Path("__main__.py")}  # what the package shows of itself, and how it is started
+
+
+def room_of(module: Path) -> str:
+    return module.parts[0].removesuffix(".py")
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """The rooms that a module imports, wherever in it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            assert not node.level, "relative imports hide where they lead"
+            names = [node.module or ""]
+            if node.module == "selfcorrect":
+                names = [f"selfcorrect.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        for name in names:
+            package, _, rest = name.partition(".")
+            if package == "selfcorrect":
+                yield rest.partition(".")[0]
+
+
+def wrong(module: Path, source: str) -> list[str]:
+    """What a module imports although it lies above or beside."""
+    own = room_of(module)
+    rooms = set(imported(ast.parse(source))) - {own}
+    return sorted(room for room in rooms if LEVEL[room] > LEVEL[own] or LEVEL[room] == LEVEL[own] > 0)
+
+
+def prints(source: str) -> bool:
+    """Whether a module calls print, or writes to stdout or stderr."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
+            return True
+        if isinstance(node, ast.Attribute) and node.attr in ("stdout", "stderr"):
+            return True
+    return False
+
+
+def test_every_module_has_its_room() -> None:
+    assert {room_of(module) for module in MODULES if module not in OUTSIDE} == set(LEVEL)
+
+
+def test_no_module_imports_from_a_room_above_it() -> None:
+    sources = {module: (PACKAGE / module).read_text(encoding="utf-8") for module in MODULES if module not in OUTSIDE}
+    assert {module: rooms for module, source in sources.items() if (rooms := wrong(module, source))} == {}
+
+
+def test_only_the_command_prints() -> None:
+    others = [module for module in MODULES if room_of(module) != "cli"]
+    assert [module for module in others if prints((PACKAGE / module).read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "rooms"),
+    [
+        ("frame.py", "from selfcorrect.stages.core import train", ["stages"]),
+        ("frame.py", "def late():\n    from selfcorrect import correct, errors", ["correct"]),
+        ("exr/file.py", "import selfcorrect.frame as f", ["frame"]),
+        ("shot/run.py", "from selfcorrect.cli.terminal import log", ["cli"]),
+        ("shot/run.py", "from selfcorrect.shot.chain import Chain\nfrom selfcorrect import files\nimport torch", []),
+    ],
+)
+def test_a_wrong_import_would_be_seen(module: str, source: str, rooms: list[str]) -> None:
+    assert wrong(Path(module), source) == rooms
+
+
+@pytest.mark.parametrize(
+    ("source", "seen"),
+    [("print(1)", True), ("import sys; sys.stderr.write('x')", True), ("# print()\nprinted = 'print(1)'", False)],
+)
+def test_a_print_would_be_seen(source: str, seen: bool) -> None:
+    assert prints(source) is seen
