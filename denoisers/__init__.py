@@ -26,6 +26,8 @@ def names() -> tuple[str, ...]:
     """Return every form of a denoiser's specification that :func:`create` takes."""
     return (
         "oidn",
+        "oidn:fast",
+        "oidn:none",
         "joint-bilateral",
         "box",
         "nlm",
@@ -68,8 +70,8 @@ def create(spec: str, *, threads: int | None = None, scratch: int | None = None)
 def _plugin(spec: str, threads: int | None, scratch: int | None) -> Plugin | DualPlugin:
     plugin: Plugin | DualPlugin
     match spec.split(":", maxsplit=1):
-        case ["oidn"]:
-            plugin = _adapter("oidn", extra="oidn").Oidn(threads, scratch)
+        case ["oidn", *_]:
+            plugin = _adapter("oidn", extra="oidn").oidn(spec, threads, scratch)
         case ["joint-bilateral"]:
             plugin = _adapter("joint_bilateral").JointBilateral(threads)
         case ["box"]:

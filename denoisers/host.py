@@ -25,6 +25,9 @@ class Plugin(Protocol):
         name: what messages call it.
         multiple: height and width are padded to a multiple of this number of pixels.
         features: those of ``"albedo"`` and ``"normal"`` that it uses; it gets no others.
+        prefilter: a method, where the denoiser wants features that were denoised first: it takes albedo and normal as
+            :meth:`denoise` does and returns both, finite and of the same shapes. :meth:`denoise` then gets its results.
+            The host calls it, so that features are denoised once for all images that go with them.
         reads_only: it leaves its arguments alone, and takes float16 as well as float32: it is spared a copy of them,
             which of a large frame is a gigabyte. By default False.
     """
@@ -78,13 +81,44 @@ class Denoise:
         self.dual: bool = getattr(plugin, "dual", False)
         self._shares = getattr(plugin, "reads_only", False)
 
-    def __call__(self, color: Image, albedo: Array | None = None, normal: Array | None = None) -> Image:
+    def prefilter(self, albedo: Array | None = None, normal: Array | None = None) -> tuple[Array | None, Array | None]:
+        """Albedo and normal as the denoiser wants them, for any number of images that go with them.
+
+        They become CPU tensors, float32, or float16 where they were and the plug-in takes those. A denoiser that wants
+        them as they are gets them so.
+
+        Raises:
+            FrameError, DenoiserError: as for denoising.
+        """
+        prefilter = getattr(self.plugin, "prefilter", None)
+        given = {"albedo": albedo, "normal": normal}
+        there = {name: value for name, value in given.items() if value is not None and name in self.features}
+        if prefilter is None or not there:
+            return albedo, normal
+        size = None
+        for name, value in there.items():
+            size = _checked_size(name, value, size)
+        assert size is not None  # tells the type checker: there is at least one
+        pad = self._pad(size)
+        padded = {name: mirrored(self._checked(name, value, half=True), **pad) for name, value in there.items()}
+        with torch.no_grad():
+            results = prefilter(padded.get("albedo"), padded.get("normal"))
+        for name, result in zip(given, results, strict=True):
+            if name in there:
+                self._check_result(result, tuple(padded[name].shape))
+                given[name] = result[: size[0], : size[1]].contiguous()
+        return given["albedo"], given["normal"]
+
+    def __call__(
+        self, color: Image, albedo: Array | None = None, normal: Array | None = None, *, prefiltered: bool = False
+    ) -> Image:
         """Denoise one image.
 
         Args:
             color: (H, W, 3) linear HDR radiance, NumPy or torch, of any float dtype.
             albedo: (H, W, 3) albedo in [0, 1], of either kind, or None.
             normal: (H, W, 3) normal in [-1, 1], of either kind, or None.
+            prefiltered: albedo and normal are what :meth:`prefilter` made of them; if not, it is called here.
 
         Returns:
             (H, W, 3) linear radiance, unclamped, of the kind, dtype and device of ``color``. A value that
@@ -100,7 +134,9 @@ class Denoise:
         for name, feature in (("albedo", albedo), ("normal", normal)):
             if feature is not None:
                 _checked_size(name, feature, size)
-        pad = {"bottom": -size[0] % self.multiple, "right": -size[1] % self.multiple}
+        if not prefiltered:
+            albedo, normal = self.prefilter(albedo, normal)
+        pad = self._pad(size)
         padded: torch.Tensor = mirrored(self._checked("color", color), **pad)
         with torch.no_grad():
             result = cast(Plugin, self.plugin).denoise(
@@ -141,6 +177,9 @@ class Denoise:
     def __repr__(self) -> str:
         return f"<denoiser {self.name}>"
 
+    def _pad(self, size: tuple[int, int]) -> dict[str, int]:
+        return {"bottom": -size[0] % self.multiple, "right": -size[1] % self.multiple}
+
     def _feature(self, name: str, value: Array | None, pad: dict[str, int]) -> torch.Tensor | None:
         if value is None or name not in self.features:
             return None
@@ -148,6 +187,8 @@ class Denoise:
 
     def _checked(self, name: str, value: Array, *, half: bool = False) -> torch.Tensor:
         """An image as the plug-in takes it; the caller's own memory only where the plug-in leaves that alone."""
+        if half and self._shares and isinstance(value, np.ndarray) and value.dtype == np.float16:
+            return _finite(name, torch.from_numpy(np.array(value, dtype=np.float16, order="C")))
         shared = self._shares and isinstance(value, torch.Tensor) and value.device.type == "cpu"
         kinds = (torch.float32, torch.float16) if half else (torch.float32,)
         if not (shared and isinstance(value, torch.Tensor) and value.dtype in kinds):

@@ -13,7 +13,7 @@ from selfcorrect.errors import FrameError
 from selfcorrect.image.bands import bands
 from selfcorrect.image.repair import Repairs, as_tensor, repair
 
-__all__ = ["Candidate", "DualDenoiser", "Frame", "Half", "checked", "mean"]
+__all__ = ["Candidate", "DualDenoiser", "Frame", "Half", "checked", "mean", "prefiltered"]
 
 Pair = tuple[Any, Any]
 _DENOISED_FULL = "denoised_full"
@@ -165,7 +165,8 @@ class Frame:
         Args:
             denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors, first of the mean;
                 albedo and normal may be of half floats. If its ``dual`` is True, it is called once, as
-                ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs.
+                ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs. If it has a method
+                ``prefilter``, that is called as in :func:`prefiltered`.
             full: also denoise the mean of the halves; with a dual denoiser it is the mean of the denoised halves.
         """
         if getattr(denoiser, "dual", False):
@@ -176,9 +177,9 @@ class Frame:
         denoised_full = None
         if full:  # first: there is no other denoised image in memory yet
             color, albedo, normal = (None if a is None else mean((a, b)) for a, b in zip(*inputs, strict=True))
-            denoised_full = denoiser(color, albedo=albedo, normal=normal)
+            denoised_full = denoiser(color, **prefiltered(denoiser, albedo, normal))
             del color, albedo, normal
-        pair = tuple(denoiser(color, albedo=albedo, normal=normal) for color, albedo, normal in inputs)
+        pair = tuple(denoiser(color, **prefiltered(denoiser, albedo, normal)) for color, albedo, normal in inputs)
         return self.with_denoised(pair, denoised_full)
 
     def with_denoised(self, denoised: Pair, denoised_full: Any = None) -> "Frame":
@@ -225,6 +226,19 @@ def mean(pair: Pair) -> Tensor:
     for rows in bands(len(average)):
         average[rows] = (pair[0][rows].double() + pair[1][rows].double()) / 2
     return average
+
+
+def prefiltered(denoiser: Callable[..., Any], albedo: Any, normal: Any) -> dict[str, Any]:
+    """What a denoiser is called with beside a colour, for any number of images that these G-buffers go with.
+
+    A denoiser that wants its G-buffers denoised first has a method ``prefilter`` that takes albedo and normal, either
+    or both None, and returns both; it is then called with ``prefiltered=True``.
+    """
+    prefilter = getattr(denoiser, "prefilter", None)
+    if prefilter is None:
+        return {"albedo": albedo, "normal": normal}
+    albedo, normal = prefilter(albedo, normal)
+    return {"albedo": albedo, "normal": normal, "prefiltered": True}
 
 
 def checked(

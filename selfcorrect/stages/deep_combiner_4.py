@@ -11,7 +11,7 @@ from torch import Tensor
 
 from selfcorrect.buffers import COLOR, FEATURES
 from selfcorrect.errors import FrameError
-from selfcorrect.frame import DualDenoiser, Frame, checked, mean
+from selfcorrect.frame import DualDenoiser, Frame, checked, mean, prefiltered
 from selfcorrect.image.repair import Repairs
 from selfcorrect.settings import Settings
 from selfcorrect.stages.deep_combiner import DeepCombinerStage, opened_network
@@ -64,7 +64,8 @@ class SubImages:
                 features = {name: None if value is None else (value, value) for name, value in buffers.items()}
                 denoised += cast(DualDenoiser, denoiser).pair(pair, **features)
             else:
-                denoised += [denoiser(image, albedo=half.albedo, normal=half.normal) for image in pair]
+                guides = prefiltered(denoiser, half.albedo, half.normal)
+                denoised += [denoiser(image, **guides) for image in pair]
         names = [f"denoised_{name}" for name in _NAMES]
         images, repairs = checked(COLOR, tuple(denoised), names, frame.size)
         return replace(self, denoised=images, repairs=self.repairs | {"denoised_sub_images": repairs})

@@ -41,7 +41,7 @@ class Median:
 # The tests may run without the project being installed.
 PATHS = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
-KINDS = ("oidn", "joint-bilateral", "box", "onnx", "command", "user")
+KINDS = ("oidn", "oidn:fast", "oidn:none", "joint-bilateral", "box", "onnx", "command", "user")
 
 
 @pytest.fixture(params=KINDS)
@@ -120,7 +120,7 @@ class TestContract:
     def test_hdr_is_not_clamped(self, denoise: Denoise, size: tuple[int, int]) -> None:
         result = denoise(np.full((*size, 3), 50.0))
         # OIDN is a network: its worst pixel here is 3.6 % off. The others are means or copies.
-        np.testing.assert_allclose(result, 50, rtol=0.05 if denoise.name == "oidn" else 1e-6)
+        np.testing.assert_allclose(result, 50, rtol=0.05 if denoise.name.startswith("oidn") else 1e-6)
 
     @pytest.mark.parametrize("value", [0.0, -0.0, 1e6])
     def test_extremes_stay_finite(self, denoise: Denoise, value: float) -> None:
@@ -166,6 +166,11 @@ class TestContract:
     ) -> None:
         with pytest.raises(FrameError, match=message):
             denoise(color, albedo)
+
+    def test_features_prefiltered_by_hand_give_the_same_bits(self, denoise: Denoise) -> None:
+        color, albedo, normal = (torch.from_numpy(array) for array in noisy(20, 18))
+        given = denoise.prefilter(albedo, normal)
+        assert torch.equal(denoise(color, *given, prefiltered=True), denoise(color, albedo, normal))
 
     def test_nothing_else_keeps_it_alive(self) -> None:
         for spec in ("oidn", "joint-bilateral", "box"):
@@ -249,7 +254,7 @@ class TestHost:
 
 class TestSpecifications:
     def test_names_and_default(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        assert denoisers.names()[:3] == ("oidn", "joint-bilateral", "box")
+        assert denoisers.names()[:5] == ("oidn", "oidn:fast", "oidn:none", "joint-bilateral", "box")
         assert denoisers.default() == "oidn"
         monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
         assert denoisers.default() == "onnx"
@@ -264,6 +269,12 @@ class TestSpecifications:
         for name in denoisers.names():
             assert name in str(caught.value)
 
+    @pytest.mark.parametrize("spec", ["oidn:slow", "oidn:", "oidn:fast:none", "oidn:Fast"])
+    def test_a_mode_of_oidn_that_is_none_lists_the_three(self, spec: str) -> None:
+        with pytest.raises(DenoiserError) as caught:
+            denoisers.create(spec)
+        assert str(caught.value) == f"expected oidn, oidn:fast or oidn:none, but got {spec!r}"
+
     @pytest.mark.parametrize("threads", [0, -1])
     def test_threads_are_checked(self, threads: int) -> None:
         with pytest.raises(SettingsError, match=f"threads: expected at least 1, but got {threads}"):
@@ -271,7 +282,11 @@ class TestSpecifications:
 
     @pytest.mark.parametrize(
         ("spec", "package", "extra"),
-        [("oidn", "mitsuba_oidn", "oidn"), ("onnx:model.onnx", "onnxruntime", "onnx")],
+        [
+            ("oidn", "mitsuba_oidn", "oidn"),
+            ("oidn:fast", "mitsuba_oidn", "oidn"),
+            ("onnx:model.onnx", "onnxruntime", "onnx"),
+        ],
     )
     def test_a_missing_package_says_what_to_run(
         self, monkeypatch: pytest.MonkeyPatch, spec: str, package: str, extra: str
