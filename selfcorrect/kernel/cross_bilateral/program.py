@@ -68,6 +68,12 @@ def _softplus(x):
 
 
 @triton.jit
+def _sigmoid(x):
+    e = tl.exp(-tl.abs(x))
+    return tl.where(x < 0, e, 1.0) / (1.0 + e)
+
+
+@triton.jit
 def _tanh(x):
     e = tl.exp(-2.0 * tl.abs(x))
     return tl.where(x < 0, -1.0, 1.0) * (1.0 - e) / (1.0 + e)
@@ -216,14 +222,30 @@ def _scatter(
         gamma = _softplus(x)
         s = 1.0 / (gamma * gamma + _EPSILON)
         unit = 1.0 / _LOG2_E if TERMS[m][3] else 1.0  # the logarithms are of base 2
-        value = 2.0 * unit * t * w_inverse * gamma * s * s * tl.sigmoid(x)
+        value = 2.0 * unit * t * w_inverse * gamma * s * s * _sigmoid(x)
         tl.store(to + (used + m) * to_stride, value, mask=inside)
     t = upstream[0] * change[0] + upstream[1] * change[1] + upstream[2] * change[2]
-    slope = tl.sigmoid(tl.load(heads + (used + len(TERMS)) * heads_stride)) / EVERY
+    slope = _sigmoid(tl.load(heads + (used + len(TERMS)) * heads_stride)) / EVERY
     tl.store(to + (used + len(TERMS)) * to_stride, -t * w_inverse * slope, mask=inside)  # h_c = y_c
 
 
-@triton.jit
+@triton.jit(
+    do_not_specialize=[
+        "plane_stride",
+        "row_stride",
+        "raw_patch",
+        "raw_head",
+        "raw_row",
+        "raw_column",
+        "gradient_patch",
+        "gradient_head",
+        "gradient_row",
+        "gradient_column",
+        "target_plane",
+        "height",
+        "width",
+    ]
+)
 def program(
     planes,
     raw,
@@ -258,6 +280,7 @@ def program(
     """ROWS × COLUMNS pixels of one patch; the grid is (tiles of a patch, patches).
 
     ``image`` is g, or ∂L/∂g where MODE is BACKWARD, (N, 3, height, width); ``losses`` has a value for each program.
+    What a mode does not use is None. Sizes and strides are never built in: a frame of another size compiles nothing.
     """
     patch = tl.program_id(1).to(tl.int64)
     across = tl.cdiv(width, COLUMNS)
@@ -275,13 +298,13 @@ def program(
     sums = _sweep(planes, centre, plane_stride, row_stride, activations, MODE != FORWARD, TERMS, BETAS, WINDOW, EVERY)
     w_inverse = 1.0 / sums[0]
     y_c = _load(planes, centre, plane_stride, 3)
-    pixel = image + patch * 3 * height * width + (row * width + column)
+    pixel = patch * 3 * height * width + (row * width + column)
     upstream = ()
     if MODE == FORWARD:
         for k in tl.static_range(3):
-            tl.store(pixel + k * height * width, y_c[k] + sums[1][k] * w_inverse, mask=inside)
+            tl.store(image + pixel + k * height * width, y_c[k] + sums[1][k] * w_inverse, mask=inside)
     elif MODE == BACKWARD:
-        upstream = _load(pixel, 0, height * width, 3)
+        upstream = _load(image + pixel, 0, height * width, 3)
     else:
         wanted = _load(target + first, centre, target_plane, 3)
         relative = tl.load(weight + first + centre)
