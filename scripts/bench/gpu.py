@@ -208,7 +208,7 @@ class _Counting(TorchDispatchMode):
 
 def operations(settings: Settings) -> int:
     """Of one optimiser step as a device takes it; counted on the CPU, where the kernel's own are a few more."""
-    small = replace(settings, batch=1, patch=16)  # their number does not depend on size
+    small = replace(settings, batch=1, patch=16, stride=16)  # their number does not depend on size
     step, _ = a_step(small, make_guides(32), make_guides(32), plain=True)
     step()
     with _Counting() as counting:
