@@ -28,14 +28,15 @@ from typing import Any
 
 import torch
 import triton
-from kernel import best, make_guides
+from kernel import ALL, SETS, best, make_guides
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from selfcorrect import Frame, Settings, correct
-from selfcorrect.kernel.cross_bilateral import cross_bilateral_loss, gpu, heads_count, program
+from selfcorrect.kernel.convolution.reference import convolutions as convolutions_reference
+from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral_loss, gpu, heads_count, program
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.stages.core.loss import dual_buffer_loss, relative_weight
 from selfcorrect.stages.core.network import Network
@@ -47,7 +48,7 @@ CONVOLUTION_SHARE = 0.4
 MEMORY_SHARE = 0.7
 LAUNCH = 8e-6
 REST = 0.1
-BUFFERS = {"y z": (), "y z ρ n": ("albedo", "normal"), "y z ρ n v": ("albedo", "normal", "visibility")}
+BUFFERS = {"y z": SETS["color"], "y z ρ n": SETS["color, albedo, normal"], "y z ρ n v": ALL}
 UNUSED = {"FORWARD": ("gradient", "target", "weight"), "BACKWARD": ("target", "weight"), "LOSS": ("image",)}
 """Modes of the kernel, and which pointers they are not given."""
 
@@ -115,7 +116,7 @@ class Variant:
 def compiled(target: int, mode: str, buffers: str, window: int, every: int, combination: str) -> Variant:
     """Compile one variant ahead of time."""
     terms = gpu.terms_of(make_guides(8, BUFFERS[buffers]))
-    constants = gpu.specialisation(terms, window, every, combination, gpu.TILE)
+    constants = gpu.specialisation(terms, Window(window, every, combination), gpu.TILE)
     constants["MODE"] = getattr(program, mode).value
     constants |= dict.fromkeys(UNUSED[mode])
     pointers = {"corners": "*i64"} | dict.fromkeys(
@@ -209,7 +210,7 @@ class _Counting(TorchDispatchMode):
 def operations(settings: Settings) -> int:
     """Of one optimiser step as a device takes it; counted on the CPU, where the kernel's own are a few more."""
     small = replace(settings, batch=1, patch=16, stride=16)  # their number does not depend on size
-    step, _ = a_step(small, make_guides(32), make_guides(32), plain=True)
+    step, _ = a_step(small, make_guides(32, ALL), make_guides(32, ALL), plain=True)
     step()
     with _Counting() as counting:
         step()
@@ -229,7 +230,9 @@ def a_step(
 
     def heads() -> Tensor:
         views = [patch for half in (a, b) for patch in half.views(corners, size)]
-        return network.reference(torch.stack(views)) if plain else network(views)
+        if plain:
+            return convolutions_reference(views, list(network.parameters()), log_radiance=network.log_radiance)
+        return network(views)
 
     raw = heads().detach().requires_grad_()
     upstream = torch.randn(raw.shape, generator=generator).to(raw.device)
@@ -305,16 +308,16 @@ def wait(device: torch.device) -> None:
 
 def worst_difference(device: torch.device, backend: str | None = None) -> dict[str, float]:
     """To the float64 reference, over the largest value: the loss, and the gradient of the worst head."""
-    guides = make_guides(48)
+    guides = make_guides(48, ALL)
     corners = torch.tensor([[0, 0], [5, 11]])
     raw = torch.randn(2, heads_count(guides, "eq10"), 32, 37, generator=torch.Generator().manual_seed(1))
     results = []
     for where, kind in ((torch.device("cpu"), torch.float64), (device, torch.float32)):
         planes = guides.planes.to(where, kind)
-        half = Guides(**(vars(guides) | {"planes": planes}))
+        half = replace(guides, planes=planes)
         leaf = raw.to(where, kind).requires_grad_()
         chosen = "reference" if kind == torch.float64 else backend
-        loss = cross_bilateral_loss(half, leaf, corners, half.denoised, planes[3], window=9, backend=chosen)
+        loss = cross_bilateral_loss(half, leaf, corners, half.denoised, planes[3], Window(9), backend=chosen)
         loss.backward()
         assert leaf.grad is not None
         results.append((loss.detach().cpu().double(), leaf.grad.cpu().double()))
@@ -327,8 +330,8 @@ def worst_difference(device: torch.device, backend: str | None = None) -> dict[s
 def measured(device: torch.device, preset: str, size: tuple[int, int], repeat: int) -> dict[str, float]:
     """Seconds of kernel, network, step and frame, and the peak of the device's memory in GiB."""
     settings = Settings.preset(preset)
-    halves = [make_guides(max(size[0] // 4, settings.patch)) for _ in "ab"]
-    a, b = (Guides(**(vars(half) | {"planes": half.planes.to(device)})) for half in halves)
+    halves = [make_guides(max(size[0] // 4, settings.patch), ALL) for _ in "ab"]
+    a, b = (replace(half, planes=half.planes.to(device)) for half in halves)
     step, (kernel, convolutions) = a_step(settings, a, b)
 
     def timed(function: Callable[[], None]) -> float:

@@ -1,8 +1,8 @@
 """Which form of a kernel runs: the one question about the device, asked at every call.
 
 Every kernel's folder has its forms beside one another, one signature: ``reference.py``, plain torch, ``cpu.py``,
-compiled, and where there is one ``gpu.py``, for CUDA. Its ``__init__.py`` validates, asks :func:`choose`, and calls that
-form.
+compiled, and where there is one ``gpu.py``, for CUDA. Its ``__init__.py`` validates, asks :func:`choose`, and calls
+that form.
 """
 
 from collections.abc import Sequence

@@ -75,9 +75,9 @@ def make_raw(guides: Guides, combination: str, shape: tuple[int, int, int], scal
     return scale * torch.randn(n, heads_count(guides, combination), h, w, generator=generator, dtype=torch.float64)
 
 
-def single(guides: Guides) -> Guides:
+def single(guides: Guides, device: str = "cpu") -> Guides:
     """The same in float32."""
-    return replace(guides, planes=guides.planes.float())
+    return replace(guides, planes=guides.planes.float().to(device))
 
 
 def worst(got: Tensor, expected: Tensor) -> float:
@@ -85,4 +85,4 @@ def worst(got: Tensor, expected: Tensor) -> float:
     assert got.shape == expected.shape
     assert got.isfinite().all()
     expected = expected.detach().double()
-    return float((got.detach().double() - expected).abs().max() / expected.abs().max().clamp(min=1e-9))
+    return float((got.detach().cpu().double() - expected).abs().max() / expected.abs().max().clamp(min=1e-9))

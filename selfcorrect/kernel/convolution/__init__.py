@@ -1,6 +1,6 @@
 """The network's 3×3 convolutions, one after the other: validated here, computed by one of the forms beside."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ __all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "has_fast_bf
 
 
 def has_fast_bf16(device: torch.device) -> bool:
-    """Whether torch's own convolutions in bfloat16 are faster there than in single precision; else they are emulated."""
+    """Whether torch's own convolutions in bfloat16 are fast there; else they are emulated."""
     return gpu.has_fast_bf16(device) or (device.type == "cpu" and best_instruction_set("bf16") == "amx")
 
 
@@ -62,5 +62,5 @@ def convolutions(
         limit=f"layers of at most {LARGEST_WIDTH} channels",
         gpu=True,
     )
-    convolve = {"cpu": cpu, "gpu": gpu, "reference": reference}[form].convolutions
+    convolve: Callable[..., Tensor] = {"cpu": cpu, "gpu": gpu, "reference": reference}[form].convolutions
     return convolve(images, parameters, log_radiance=log_radiance, region=region, precision=precision, threads=threads)

@@ -1,6 +1,6 @@
 """The cross-bilateral kernel (Back et al. 2022, Eqs. 3, 8, 10 and 11): validated here, computed by one of its forms.
 
-``reference.py`` is the mathematics, ``cpu.py`` the compiled form, ``gpu.py`` the one for CUDA, which needs Triton and is
+``reference.py`` is the mathematics, ``cpu.py`` the compiled form, ``gpu.py`` the one for CUDA: it needs Triton, and is
 imported when it is asked for. One for another device is a file beside them with the functions of :class:`Form`, and a
 line in :func:`_form`; until then ROCm and others run the reference, shift by shift.
 """
