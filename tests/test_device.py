@@ -20,6 +20,7 @@ from torch import Tensor
 
 from selfcorrect import Frame, Settings, cli, correct
 from selfcorrect.cli import runner
+from selfcorrect.cli.flags import add_run_flags
 from selfcorrect.errors import DeviceError, MissingPackageError
 from selfcorrect.frame import Half
 from selfcorrect.kernel import cross_bilateral as kernel
@@ -149,7 +150,7 @@ def test_without_triton(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_stays_on_the_cpu_is_told(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     parser = argparse.ArgumentParser()
-    runner.add_run_flags(parser)
+    add_run_flags(parser)
     monkeypatch.setattr(runner, "_use_machine", lambda options: None)
     flags = ["--device", "cuda", "--stages", "regression,core", "--denoiser", "nlm"]
     runner.Runner(parser.parse_args(flags), given=False)
