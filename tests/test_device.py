@@ -102,7 +102,7 @@ def test_the_combiner_never_waits() -> None:
 
 def test_a_whole_frame_through_the_interpreter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Training, inference and guard with the kernel for CUDA in the CPU's place: the same frame."""
-    changes = {"patch": 8, "batch": 1, "steps": 2, "window": 3, "layers": 3, "inference": "halves"}
+    changes = {"patch": 8, "batch": 1, "steps": 1, "window": 3, "layers": 3, "inference": "halves"}
     settings = Settings.preset("balanced", **changes)
     frame = make_frame(features=False)  # the fewer channels, the faster
     compiled = correct(frame, settings)
