@@ -1,7 +1,8 @@
 """The stages on one frame, in order, and the guard. No files, no printing, no reference."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,12 +10,13 @@ import torch
 from torch import Tensor
 
 from selfcorrect import stages
-from selfcorrect.errors import FrameError
+from selfcorrect.errors import DeviceError, FrameError
 from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.bands import average, tile_means
 from selfcorrect.image.exposure import Scaled, scale_
 from selfcorrect.settings import Settings
+from selfcorrect.stages.core.infer import SIDE
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.train import Progress
 from selfcorrect.stages.images import StageImages
@@ -63,6 +65,22 @@ class Result:
         return {name: self.outputs[name] for name in _MAPS if name in self.outputs}
 
 
+@contextmanager
+def _on_any_device() -> Iterator[None]:
+    """What makes a device other than the CPU keep the promises of :func:`correct`: the same bits, and one line."""
+    try:
+        # cuDNN's defaults may add up in any order, and round the operands of single precision to ten bits
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+            yield
+    except torch.cuda.OutOfMemoryError:
+        raise DeviceError(
+            "expected a device with memory for the frame, a step's --batch of --patch pixels and tiles of "
+            f"{SIDE} pixels, but got one that has run out; free some, take a smaller --batch or --patch, or "
+            "--device cpu, where --maxmem says beforehand what is needed"
+        ) from None
+
+
+@_on_any_device()
 def correct(
     frame: Frame,
     settings: Settings | None = None,
@@ -80,7 +98,8 @@ def correct(
         settings: by default the default preset.
         warm_start: the network of the last frame, to go on from with the settings' ``warm_steps``; it is left as it
             is. Where Eq. 8 does not show it to be the better start, as after a cut, a new one is taken.
-        progress: called as ``progress(step, steps, loss)`` after every optimiser step.
+        progress: called as ``progress(step, steps, loss)`` for every optimiser step in turn; on a device other than the
+            CPU for several together.
         stop: asked before every optimiser step; when it says True, training ends and the result so far is inferred.
         opened: the settings' stages, to spare a shot from reading their weights for every frame
             (:func:`selfcorrect.stages.opened`).
@@ -96,6 +115,7 @@ def correct(
             trained with other buffers or settings.
         FileError: the weights of a trained stage are not there or do not fit.
         SettingsError: a stage stands where it cannot.
+        DeviceError: the device is out of memory.
     """
     settings = settings or Settings.preset(Settings.default())
     given, *more = frame.candidates

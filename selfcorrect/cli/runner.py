@@ -81,6 +81,11 @@ class Runner:
             self._denoise = denoisers.create(
                 options.denoiser or denoisers.default(), threads=options.threads, scratch=scratch
             )
+        if torch.device(options.device).type != "cpu":
+            bound = [stage.name for stage in self._stages if stage.on_cpu]
+            bound += [] if self._denoise is None else [f"the denoiser {self.denoiser}"]
+            if bound:
+                log(f"{' and '.join(bound)}: on the CPU; all else on {options.device}")
 
     @property
     def denoiser(self) -> str:
@@ -202,9 +207,9 @@ def _use_machine(options: argparse.Namespace) -> None:
             raise SettingsError(f"expected --threads of at least 1, but got {options.threads}")
         torch.set_num_threads(options.threads)
     try:
-        torch.empty(0, device=options.device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
+        torch.zeros(1, device=options.device, dtype=torch.float64).cpu()  # the guard's; MPS has none
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0].partition(". ")[0]
         raise SettingsError(
             f"expected a --device that this machine has, but got {options.device!r}: {reason}"
         ) from None
