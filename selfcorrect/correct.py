@@ -13,6 +13,7 @@ from selfcorrect.frame import Frame, mean
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light
 from selfcorrect.image.bands import average, tile_means
 from selfcorrect.image.exposure import Scaled, scaled
+from selfcorrect.independence import dependence
 from selfcorrect.settings import Settings
 from selfcorrect.stages import steps, weights
 from selfcorrect.stages.core.network import Network
@@ -30,6 +31,8 @@ _STEPS = {
     "deep-combiner-4": steps.deep_combiner_4,
 }
 
+_AOVS = ("blend", "error.before", "error.after")
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -37,7 +40,8 @@ class Result:
 
     Attributes:
         image: corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as the frame's colour was.
-        network: the trained network, for the next call's ``warm_start``; None without the core.
+        network: the trained network, for the next call's ``warm_start``; None without the core, and where the guard
+            finds that the halves share their noise: then nothing is trained and the denoised image is kept.
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
@@ -93,6 +97,8 @@ def correct(
     given = mean(frame.denoised) if frame.denoised_full is None else frame.denoised_full
     sub_images = _sub_images(frame) if "deep-combiner-4" in settings.stage_names else ()
     first = StageImages(frame.halves, given, settings.input_scale or _automatic_scale(frame), sub_images)
+    if settings.guard and dependence(*frame.color).tells_nothing:
+        return _kept(frame, first)
     state, core, seconds = first, None, dict[str, float]()
 
     def timed(name: str, begun: float) -> None:
@@ -124,9 +130,24 @@ def correct(
         losses=core.losses if core else [],
         seconds=seconds,
         estimate=guarded.estimate if guarded else None,
-        aovs=dict(zip(("blend", "error.before", "error.after"), guarded.maps(), strict=True)) if guarded else {},
+        aovs=dict(zip(_AOVS, guarded.maps(), strict=True)) if guarded else {},
         input_scale=first.scale,
         start=core.start if core else Start(warm=False),
+    )
+
+
+def _kept(frame: Frame, first: StageImages) -> Result:
+    """The denoised image: halves that share their noise can neither train nor judge a correction."""
+    nothing = torch.zeros(frame.size)
+    return Result(
+        image=frame.like_input(first.full.clamp(min=0)),
+        network=None,
+        losses=[],
+        seconds={},
+        estimate=Estimate(0.0, 0.0, 0.0, 0.0, 0.0, improved=False, independent=False),
+        aovs={name: nothing.clone() for name in _AOVS},
+        input_scale=first.scale,
+        start=Start(warm=False),
     )
 
 
