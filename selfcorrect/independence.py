@@ -56,7 +56,7 @@ class Dependence:
         identical: they are equal to the bit.
         share: how much of the noise variance they share, 0 … 1; 0 where it cannot be told.
         standard_error: of ``share``; infinite where it cannot be told.
-        whiteness: of what they share: 1 of noise, near 0 of detail.
+        whiteness: of what they share: 1 of noise, near 0 of detail and of nothing; 1 where the frame is too small.
         tiles: how many tell this.
     """
 
@@ -74,8 +74,11 @@ class Dependence:
 
     @property
     def tells_nothing(self) -> bool:
-        """Whether one half says nothing about the error of the other: no gain may be claimed."""
-        return self.identical or self.noisy
+        """Whether one half says nothing about the error of the other: no gain may be claimed.
+
+        Equal halves do so but where they hold detail and no noise.
+        """
+        return self.noisy or (self.identical and self.whiteness > _WHITE)
 
 
 def doubts(frame: Frame) -> list[str]:
@@ -112,7 +115,7 @@ def dependence(a: Tensor, b: Tensor) -> Dependence:
     judged = (seen[:, even].sum((1, 2)) >= _FEWEST_SIGNS) & (seen[:, ~even].sum((1, 2)) >= _FEWEST_SIGNS)
     kept = math.ceil(_BELIEVED * int(judged.sum()))
     if not kept:
-        return Dependence(identical, 0.0, math.inf, 0.0, 0)
+        return Dependence(identical, 0.0, math.inf, float(not len(judged)), 0)
     agreed, counted, fine_power, coarse_power = (
         torch.stack([x[:, even].sum((1, 2)), x[:, ~even].sum((1, 2))])[:, judged]
         for x in (agreement, seen, fine_a * fine_b / len(_FINEST), coarse[0] * coarse[1])
