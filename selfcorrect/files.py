@@ -113,7 +113,11 @@ def load(sources: Sources) -> Loaded:
     if sources.sub_images:
         _check_different(sources.sub_images)
         pairs["sub_images"] = tuple(_color_of(path, (height, width)) for path in sources.sub_images)
-    return Loaded(Frame(**pairs), Origin(sources.a, taken, stamp))
+    try:
+        frame = Frame(**pairs)
+    except FrameError as error:
+        raise FrameError(f"{sources.a} (half a), {sources.b} (half b): {error}") from None
+    return Loaded(frame, Origin(sources.a, taken, stamp))
 
 
 class _Half(NamedTuple):

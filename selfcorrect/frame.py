@@ -19,6 +19,7 @@ _CHANNELS = {"color": 3, "denoised": 3, "albedo": 3, "normal": 3, "visibility": 
 _RADIANCE = ("color", "denoised", "denoised_full", "sub_images", "denoised_sub_images")
 _SUB_IMAGE_TOLERANCE = 5e-3  # of radiance: half floats round to 1/2048, and a mean of such again
 _SUB_IMAGE_PIXELS = 0.01  # share that may differ: what was repaired, or lay beyond half floats
+_MOST_REPAIRED = 0.5  # share of a radiance channel's pixels: with more, what is filled in is no render
 _FEATURES = ("albedo", "normal", "visibility", "depth")
 
 
@@ -52,9 +53,9 @@ class Frame:
 
     Every buffer is a pair of (H, W, C) float arrays, NumPy or torch; (H, W) will do for one channel. They become
     float32 tensors; G-buffers of half floats stay what they are, and take half the memory. A tensor that needs no
-    change is not copied. Pixels that are NaN or infinite are filled from their finite neighbours, negative radiance
-    is clipped at 0 (as published), and both are counted in ``repairs``. A G-buffer that is the same at every pixel
-    says nothing and only costs time: it becomes None, and its name is in ``constant``.
+    change is not copied. Values that are NaN or infinite are filled from the finite ones around them in their channel,
+    negative radiance is clipped at 0 (as published), and the pixels of both are counted in ``repairs``. A G-buffer that
+    is the same at every pixel says nothing and only costs time: it becomes None, and its name is in ``constant``.
 
     Args:
         color: noisy linear radiance, 3 channels, ≥ 0.
@@ -69,7 +70,8 @@ class Frame:
         denoised_sub_images: those denoised, each on its own.
 
     Raises:
-        FrameError: sizes or channel counts do not fit.
+        FrameError: sizes or channel counts do not fit, or a channel of radiance is NaN or infinite at more than half
+            of its pixels.
     """
 
     color: Pair
@@ -122,6 +124,8 @@ class Frame:
                     f"but got {tensor.shape[1]}x{tensor.shape[0]}"
                 )
             size = (tensor.shape[0], tensor.shape[1])
+            if name in _RADIANCE:
+                _check_finite(tensor, what)
             tensor, repairs = _repair(tensor, radiance=name in _RADIANCE)
             tensors.append(tensor)
             counts = Repairs(*(x + y for x, y in zip(counts, repairs, strict=True)))
@@ -286,9 +290,20 @@ def _as_tensor(array: Any, what: str, channels: int, *, half: bool) -> Tensor:
     return tensor if half and tensor.dtype == torch.float16 else tensor.float()
 
 
+def _check_finite(image: Tensor, what: str) -> None:
+    """Raise where a channel of radiance holds too few finite values to be filled from."""
+    pixels = image.shape[0] * image.shape[1]
+    for channel, broken in zip("RGB", (~image.isfinite()).sum((0, 1)).tolist(), strict=True):
+        if broken > _MOST_REPAIRED * pixels:
+            raise FrameError(
+                f"expected finite radiance at {1 - _MOST_REPAIRED:.0%} of the pixels or more in channel {channel} of "
+                f"{what}, but got NaN or infinity at {broken} of {pixels}; render it again"
+            )
+
+
 def _repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:
-    finite = image.isfinite().all(-1)
-    broken = int((~finite).sum())
+    finite = image.isfinite()
+    broken = int((~finite.all(-1)).sum())
     if broken:
         image = _fill(image.float(), finite).to(image.dtype)
     negative = int((image < 0).any(-1).sum()) if radiance else 0
@@ -298,11 +313,11 @@ def _repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:
 
 
 def _fill(image: Tensor, known: Tensor) -> Tensor:
-    """Fill unknown pixels from the known ones around them, nearer ones first (push-pull); all unknown gives 0."""
-    weight = known.to(image.dtype)[None, None]
-    value = torch.where(known[..., None], image, 0.0).permute(2, 0, 1)[None]
+    """Fill unknown values from those of the channel around them, nearer ones first (push-pull); all unknown gives 0."""
+    weight = known.to(image.dtype).permute(2, 0, 1)[None]
+    value = torch.where(known, image, 0.0).permute(2, 0, 1)[None]
     filled = _push_pull(value, weight)[0].permute(1, 2, 0)
-    return torch.where(known[..., None], image, filled)
+    return torch.where(known, image, filled)
 
 
 def _push_pull(value: Tensor, weight: Tensor) -> Tensor:
