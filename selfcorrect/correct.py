@@ -15,6 +15,7 @@ from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.bands import average, tile_means
 from selfcorrect.image.exposure import Scaled, scale_
+from selfcorrect.independence import dependence
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.infer import SIDE
 from selfcorrect.stages.core.network import Network
@@ -38,7 +39,8 @@ class Result:
         outputs: images by name. ``color`` is the corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as
             the frame's colour was. Where the guard is on there are its maps, tensors (H, W): ``blend`` (weight of what
             the stages made), and ``error.before`` and ``error.after`` (estimated relative squared error).
-        network: the trained network, for the next call's ``warm_start``; None without the core.
+        network: the trained network, for the next call's ``warm_start``; None without the core, and where the guard
+            finds that the halves share their noise: then nothing is trained and the denoised image is kept.
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
@@ -125,6 +127,8 @@ def correct(
         learning = " or ".join(name for name, stage in stages.STAGES.items() if stage.learns)
         raise FrameError(f"expected the stage {learning} with a warm start, but got the stages {settings.stages}")
     first = StageImages.of(frame.halves, given, settings.input_scale or _automatic_scale(frame))
+    if settings.guard and dependence(*frame.color).tells_nothing:
+        return _kept(frame, first)
     judge = _Judge(first, more) if settings.guard else None
     state, learned, seconds = first, None, dict[str, float]()
     for stage in opened:
@@ -153,6 +157,20 @@ def correct(
         estimate=guarded.estimate if guarded else None,
         input_scale=first.scale,
         start=learned.start if learned else Start(warm=False),
+    )
+
+
+def _kept(frame: Frame, first: StageImages) -> Result:
+    """The denoised image: halves that share their noise can neither train nor judge a correction."""
+    nothing = torch.zeros(frame.size)
+    return Result(
+        outputs={COLOR_OUTPUT: frame.like_input(first.full.clamp(min=0)), **{name: nothing.clone() for name in _MAPS}},
+        network=None,
+        losses=[],
+        seconds={},
+        estimate=Estimate(0.0, 0.0, 0.0, 0.0, 0.0, improved=False, independent=False),
+        input_scale=first.scale,
+        start=Start(warm=False),
     )
 
 
