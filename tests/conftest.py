@@ -20,6 +20,8 @@ from selfcorrect import cli
 HAS_BLENDER = sys.version_info[:2] == (3, 11) and platform.machine() != "aarch64"
 """Where the package bpy has a wheel, the tests demand it."""
 
+_LACKING = pytest.StashKey[list[pytest.Item]]()
+
 torch.utils.deterministic.fill_uninitialized_memory = True
 torch.use_deterministic_algorithms(mode=True)
 
@@ -84,4 +86,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     there["browser"] = all(shutil.which(program) for program in ("chromium", "chromedriver"))
     lacking = [item for item in items if any(item.get_closest_marker(need) and not there[need] for need in there)]
     config.hook.pytest_deselected(items=lacking)
+    config.stash[_LACKING] = [item for item in lacking if item.get_closest_marker("browser")]
     items[:] = [item for item in items if item not in lacking]
+
+
+def pytest_report_collectionfinish(config: pytest.Config) -> list[str]:
+    """Name the tests that lack a browser, which many a machine could have."""
+    names = dict.fromkeys(item.name.partition("[")[0] for item in config.stash.get(_LACKING, []))
+    return [f"left out without chromium and chromedriver (scripts/setup-chromium): {', '.join(names)}"] if names else []

@@ -11,14 +11,14 @@ from typing import Any
 from selfcorrect import exr, report
 from selfcorrect.correct import Result
 from selfcorrect.errors import SelfcorrectError
-from selfcorrect.frame import Frame, mean
+from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
 from selfcorrect.publish import publish
 from selfcorrect.report.shot import looked_at
 from selfcorrect.settings import Settings
 from selfcorrect.shot.run import Outcome
 
-__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "add_flag", "facts_of", "target", "write"]
+__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "add_flag", "facts_of", "images_of", "target", "write"]
 
 MAPS = ("error.before", "error.after", "blend")
 """Of a result's maps, in the order of the page."""
@@ -76,9 +76,10 @@ def _estimate(found: Any) -> dict[str, Any] | None:
     return {name: found[name] for name in names}
 
 
-def _images(frame: Frame, corrected: Any) -> dict[str, Any]:
-    denoised = frame.candidates[0].full
-    return {"noisy": mean(frame.color), "denoised": denoised, "corrected": corrected}
+def images_of(frame: Frame, corrected: Any) -> dict[str, tuple[Any, ...]]:
+    """What is to be looked at: name → images whose mean it is."""
+    denoised = frame.denoised if frame.denoised_full is None else (frame.denoised_full,)
+    return {"noisy": frame.color, "denoised": denoised or (), "corrected": (corrected,)}
 
 
 class FramePage:
@@ -97,7 +98,7 @@ class FramePage:
 
     def gather(self, frame: Frame, result: Result) -> None:
         """Keep what is to be looked at."""
-        self._images = {name: report.shrunk(image) for name, image in _images(frame, result.image).items()}
+        self._images = {name: report.shrunk(*parts) for name, parts in images_of(frame, result.image).items()}
         self._maps = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
 
     def write(self, facts: Mapping[str, Any]) -> None:
@@ -125,13 +126,13 @@ class ShotPage:
         """What keeps a frame of this number."""
 
         def keep(frame: Frame, result: Result) -> None:
-            images = _images(frame, result.image)
+            images = images_of(frame, result.image)
             kept: dict[str, Any] = {
-                "thumbnail": report.thumbnail(images["corrected"]),
-                "rows": {name: report.slice_of(image) for name, image in images.items()},
+                "thumbnail": report.thumbnail(*images["corrected"]),
+                "rows": {name: report.slice_of(*parts) for name, parts in images.items()},
             }
             if number in self._kept:
-                kept["images"] = {name: report.shrunk(image) for name, image in images.items()}
+                kept["images"] = {name: report.shrunk(*parts) for name, parts in images.items()}
                 kept["maps"] = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
             self._pictures[number] = kept
 

@@ -37,7 +37,7 @@ class Viewer {
     this.divider = this.dividerElement();
     this.legend = make("div", { class: "legend" });
     this.inspector = make("div", { class: "inspector" });
-    const keys = [["1 – 9", "images"], ["space", "flips between the last two"], ["s o g", "slider, one image, side by side"], ["[ ]", "exposure"], ["+ −", "zoom"], ["0", "fit"], ["arrows", "move"]];
+    const keys = [["1 – 9", "images"], ["space", "flips between the last two"], ["s o g", "slider, one image, side by side"], ["[ ]", "exposure"], ["+ −", "zoom, like the wheel after a click"], ["0", "fit"], ["arrows", "move"]];
     const hint = make("p", { class: "hint keys" }, ...keys.flatMap(([key, does]) => [make("kbd", {}, key), ` ${does} `]));
     const remark = [...root.children];
     root.append(

@@ -50,16 +50,15 @@ def looked_at(numbers: Sequence[int]) -> set[int]:
     return {numbers[round(i * (len(numbers) - 1) / (_LOOKED_AT - 1))] for i in range(_LOOKED_AT)}
 
 
-def thumbnail(image: Any) -> Array:
-    """An image small enough for the strip."""
-    return shrunk(image, _THUMBNAIL)
+def thumbnail(*images: Any) -> Array:
+    """An image, or the mean of several, small enough for the strip."""
+    return shrunk(*images, pixels=_THUMBNAIL)
 
 
-def slice_of(image: Any) -> Array:
-    """The middle row of an image, (W, 3) float16, of at most 640 pixels."""
-    row = shrunk(image[image.shape[0] // 2][None], _ROW)
-    narrow: Array = row[0]
-    return narrow
+def slice_of(*images: Any) -> Array:
+    """The middle row of an image, or of the mean of several, (W, 3) float16, of at most 640 pixels."""
+    row: Array = shrunk(*(image[image.shape[0] // 2][None] for image in images), pixels=_ROW)[0]
+    return row
 
 
 def shot_page(frames: Sequence[ShotFrame], facts: Mapping[str, Any], *, limit: int = LARGEST_PAGE) -> str:
