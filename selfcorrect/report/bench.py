@@ -45,7 +45,7 @@ def bench_page(
         summary=f"<p class='headline'>{escape(_summary(told))}.</p>",
         body='<section id="pareto" aria-label="Seconds against error"></section>'
         + section("Points", _table(points, told)),
-        data={"kind": "bench", "points": told},
+        data={"points": told},
         scripts=("pareto.js",),
     )
 

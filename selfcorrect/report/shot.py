@@ -103,7 +103,7 @@ def shot_page(frames: Sequence[ShotFrame], facts: Mapping[str, Any], *, limit: i
         summary=f"<p class='headline'>{escape(_summary(frames))}.</p>",
         body='<section id="strip" aria-label="Frames of the shot"></section>'
         f'{viewer(remark)}<section id="slice" aria-label="A row through time"></section>{rest}',
-        data={"kind": "shot", "frames": told, "slices": slices, "labels": LABELS},
+        data={"frames": told, "slices": slices, "labels": LABELS},
         scripts=("viewer.js", "controls.js", "strip.js"),
     )
 
