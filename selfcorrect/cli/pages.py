@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -107,6 +107,18 @@ class FramePage:
         write(self._page, report.frame_page(self._images, self._maps, {**facts, "title": title}))
 
 
+def _summed(given: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Numbers by name, or by name and name, summed over frames."""
+    total: dict[str, Any] = {}
+    for one in given:
+        for name, value in one.items():
+            if isinstance(value, Mapping):
+                total[name] = _summed([total.get(name, {}), value])
+            else:
+                total[name] = total.get(name, 0) + value
+    return total
+
+
 class ShotPage:
     """The page of a shot, gathered frame by frame."""
 
@@ -132,8 +144,8 @@ class ShotPage:
                 "rows": {name: report.slice_of(*parts) for name, parts in images.items()},
             }
             if number in self._kept:
-                kept["images"] = {name: report.shrunk(*parts) for name, parts in images.items()}
-                kept["maps"] = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
+                kept["images"] = {name: report.still(*parts) for name, parts in images.items()}
+                kept["maps"] = {name: report.still(result.maps[name]) for name in MAPS if name in result.maps}
             self._pictures[number] = kept
 
         return keep
@@ -153,6 +165,7 @@ class ShotPage:
     def write(self, title: str, settings: Settings, more: Mapping[str, Any]) -> None:
         """Write the page, of the frames there are; ``more`` is what all of them share."""
         written = [frame.facts for frame in self._frames if frame.outcome == "written"]
+        totals = {name: _summed(facts[name] for facts in written) for name in ("seconds", "repairs")} if written else {}
         shared = {name: written[0][name] for name in ("channels", "threads", "version") if written}
-        facts = {"title": Path(title).name, "settings": settings.to_dict(), **shared, **more}
+        facts = {"title": Path(title).name, "settings": settings.to_dict(), **shared, **totals, **more}
         write(self._page, report.shot_page(self._frames, facts))

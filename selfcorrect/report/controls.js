@@ -78,12 +78,15 @@ class Viewer {
   }
   /** Show other images in the same view, as another frame of a shot. */
   load(layers, scale, origin = [0, 0]) {
+    const size = (some) => [...some.values()].slice(0, 1).map(({ width, height }) => `${width} ${height}`).join();
     const first = !this.layers.size;
+    if (size(layers) !== size(this.layers)) {
+      this.view.fit = true;
+      this.cursor = null;
+    }
     this.layers = layers;
     this.scale = scale;
     this.origin = origin;
-    this.view.fit = true;
-    this.cursor = null;
     const names = [...layers.keys()];
     if (!layers.has(this.left)) this.left = layers.has("denoised") ? "denoised" : names[0];
     if (!layers.has(this.right)) this.right = layers.has("corrected") ? "corrected" : names[names.length - 1];

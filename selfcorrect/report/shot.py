@@ -12,11 +12,11 @@ from selfcorrect.report.frame import LABELS, layers, note, viewer
 from selfcorrect.report.html import assembled, facts_sections, section, table
 from selfcorrect.report.pack import LARGEST_PAGE, Array, fitted, pack, shrunk
 
-__all__ = ["ShotFrame", "looked_at", "shot_page", "slice_of", "thumbnail"]
+__all__ = ["ShotFrame", "looked_at", "shot_page", "slice_of", "still", "thumbnail"]
 
 _ROOM = 400_000  # bytes for all that is no image
 _STRIP, _SLICE = 0.2, 0.2  # shares of the images' bytes
-_THUMBNAIL, _ROW = 20_000, 640  # pixels at most, of a thumbnail and of a slice's width
+_THUMBNAIL, _STILL, _ROW = 20_000, 350_000, 640  # pixels at most; the last, of a slice's width
 _LOOKED_AT = 6  # frames
 
 
@@ -48,6 +48,11 @@ def looked_at(numbers: Sequence[int]) -> set[int]:
     if len(numbers) <= _LOOKED_AT:
         return set(numbers)
     return {numbers[round(i * (len(numbers) - 1) / (_LOOKED_AT - 1))] for i in range(_LOOKED_AT)}
+
+
+def still(*images: Any) -> Array:
+    """An image or a map, or the mean of several, of a frame to be looked at, not larger than the page has room for."""
+    return shrunk(*images, pixels=_STILL)
 
 
 def thumbnail(*images: Any) -> Array:

@@ -81,6 +81,7 @@ def test_page_of_a_shot(shot_folder: Path) -> None:
     assert [frame["number"] for frame in frames] == [1, 2, 3, 4, 5]
     assert all(frame["layers"] and frame["thumbnail"] and frame["change"] is not None for frame in frames)
     assert set(data_of(page.read_text())["slices"]) == {"noisy", "denoised", "corrected"}
+    assert "None: no NaN" in page.read_text()
 
 
 def test_page_of_a_shot_that_goes_on(shot_folder: Path) -> None:
