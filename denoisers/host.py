@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from denoisers import exposure
 from denoisers.mirror import mirrored
 from selfcorrect.errors import DenoiserError, FrameError
 
@@ -138,12 +139,17 @@ class Denoise:
             albedo, normal = self.prefilter(albedo, normal)
         pad = self._pad(size)
         padded: torch.Tensor = mirrored(self._checked("color", color), **pad)
+        exponent = exposure.exponent((padded,))
+        if exponent is None:
+            return _like(color, torch.zeros(*size, 3))
         with torch.no_grad():
             result = cast(Plugin, self.plugin).denoise(
-                padded, self._feature("albedo", albedo, pad), self._feature("normal", normal, pad)
+                exposure.shifted(padded, exponent),
+                self._feature("albedo", albedo, pad),
+                self._feature("normal", normal, pad),
             )
         self._check_result(result, tuple(padded.shape))
-        return _like(color, result[: size[0], : size[1]])
+        return _like(color, exposure.shifted(result[: size[0], : size[1]], -exponent))
 
     def pair(self, color: tuple[Image, Image], **features: tuple[Array, Array] | None) -> tuple[Image, Image]:
         """Denoise both halves of a frame with a plug-in that is ``dual``.
@@ -166,13 +172,17 @@ class Denoise:
             for feature in pair:
                 _checked_size(name, feature, (height, width), channels=1 if name in ("depth", "visibility") else 3)
             given[name] = (_finite(name, _float32(pair[0])), _finite(name, _float32(pair[1])))
+        halves = _finite("color", _float32(color[0])), _finite("color", _float32(color[1]))
+        exponent = exposure.exponent(halves)
+        if exponent is None:
+            return _like(color[0], torch.zeros(height, width, 3)), _like(color[1], torch.zeros(height, width, 3))
+        lit = exposure.shifted(halves[0], exponent), exposure.shifted(halves[1], exponent)
         with torch.no_grad():
-            results = cast(DualPlugin, self.plugin).denoise_pair(
-                (_finite("color", _float32(color[0])), _finite("color", _float32(color[1]))), given
-            )
+            results = cast(DualPlugin, self.plugin).denoise_pair(lit, given)
         for result in results:
             self._check_result(result, (height, width, 3))
-        return _like(color[0], results[0]), _like(color[1], results[1])
+        first, second = (exposure.shifted(result, -exponent) for result in results)
+        return _like(color[0], first), _like(color[1], second)
 
     def __repr__(self) -> str:
         return f"<denoiser {self.name}>"

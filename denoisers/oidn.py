@@ -46,10 +46,9 @@ class Oidn:
         Args:
             threads: of the CPU; None leaves the number to OIDN.
             scratch: bound of the filter's own memory, bytes: it goes through the image in tiles, with the same bits.
-                It takes some 0.34 GiB at least. Left to itself it takes 1.1 GiB of 1920×1080, 2.9 GiB of
-                7680×4320.
+                It takes some 0.34 GiB at least. Left to itself it takes 1.1 GiB of 1920×1080, 2.9 GiB of 7680×4320.
             name: what messages call it.
-            clean_features: OIDN's ``cleanAux``: albedo and normal are taken for free of noise, their detail is kept.
+            clean_features: OIDN's ``cleanAux``: albedo and normal are taken for noise-free, their detail is kept.
         """
         self.name = name
         self.scratch = scratch or _SCRATCH

@@ -1,18 +1,22 @@
 """The stages on one frame, in order, and the guard. No files, no printing, no reference."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from selfcorrect import stages
-from selfcorrect.errors import FrameError
+from selfcorrect.errors import DeviceError, FrameError
 from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
+from selfcorrect.independence import dependence
 from selfcorrect.settings import Settings
+from selfcorrect.stages.core.infer import SIDE
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.train import Progress
 from selfcorrect.stages.images import StageImages
@@ -34,7 +38,8 @@ class Result:
         outputs: images by name. ``color`` is the corrected linear radiance, (H, W, 3) ≥ 0, the same kind of array as
             the frame's colour was. Where the guard is on there are its maps, tensors (H, W): ``blend`` (weight of what
             the stages made), and ``error.before`` and ``error.after`` (estimated relative squared error).
-        network: the trained network, for the next call's ``warm_start``; None without the core.
+        network: the trained network, for the next call's ``warm_start``; None without the core, and where the guard
+            finds that the halves share their noise: then nothing is trained and the denoised image is kept.
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
@@ -61,6 +66,22 @@ class Result:
         return {name: self.outputs[name] for name in _MAPS if name in self.outputs}
 
 
+@contextmanager
+def _on_any_device() -> Iterator[None]:
+    """What makes a device other than the CPU keep the promises of :func:`correct`: the same bits, and one line."""
+    try:
+        # cuDNN's defaults may add up in any order, and round the operands of single precision to ten bits
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
+            yield
+    except torch.cuda.OutOfMemoryError:
+        raise DeviceError(
+            "expected a device with memory for the frame, a step's --batch of --patch pixels and tiles of "
+            f"{SIDE} pixels, but got one that has run out; free some, take a smaller --batch or --patch, or "
+            "--device cpu, where --maxmem says beforehand what is needed"
+        ) from None
+
+
+@_on_any_device()
 def correct(
     frame: Frame,
     settings: Settings | None = None,
@@ -78,7 +99,8 @@ def correct(
         settings: by default the default preset.
         warm_start: the network of the last frame, to go on from with the settings' ``warm_steps``; it is left as it
             is. Where Eq. 8 does not show it to be the better start, as after a cut, a new one is taken.
-        progress: called as ``progress(step, steps, loss)`` after every optimiser step.
+        progress: called as ``progress(step, steps, loss)`` for every optimiser step in turn; on a device other than the
+            CPU for several together.
         stop: asked before every optimiser step; when it says True, training ends and the result so far is inferred.
         opened: the settings' stages, to spare a shot from reading their weights for every frame
             (:func:`selfcorrect.stages.opened`).
@@ -94,6 +116,7 @@ def correct(
             trained with other buffers or settings.
         FileError: the weights of a trained stage are not there or do not fit.
         SettingsError: a stage stands where it cannot.
+        DeviceError: the device is out of memory.
     """
     settings = settings or Settings.preset(Settings.default())
     given, *more = frame.candidates
@@ -103,6 +126,8 @@ def correct(
         learning = " or ".join(name for name, stage in stages.STAGES.items() if stage.learns)
         raise FrameError(f"expected the stage {learning} with a warm start, but got the stages {settings.stages}")
     first = StageImages.of(frame.halves, given, settings.input_scale or scale_to_one(given.halves))
+    if settings.guard and dependence(*frame.color).tells_nothing:
+        return _kept(frame, first)
     judge = _Judge(first, more) if settings.guard else None
     state, learned, seconds = first, None, dict[str, float]()
     for stage in opened:
@@ -131,6 +156,20 @@ def correct(
         estimate=guarded.estimate if guarded else None,
         input_scale=first.scale,
         start=learned.start if learned else Start(warm=False),
+    )
+
+
+def _kept(frame: Frame, first: StageImages) -> Result:
+    """The denoised image: halves that share their noise can neither train nor judge a correction."""
+    nothing = torch.zeros(frame.size)
+    return Result(
+        outputs={COLOR_OUTPUT: frame.like_input(first.full.clamp(min=0)), **{name: nothing.clone() for name in _MAPS}},
+        network=None,
+        losses=[],
+        seconds={},
+        estimate=Estimate(0.0, 0.0, 0.0, 0.0, 0.0, improved=False, independent=False),
+        input_scale=first.scale,
+        start=Start(warm=False),
     )
 
 

@@ -8,6 +8,7 @@
     ├── FrameError              buffers that do not fit together
     ├── SettingsError           an unknown setting, preset, or a value out of range
     ├── DenoiserError           a denoiser that is unknown, does not fit, or failed
+    ├── DeviceError             a device that is out of memory
     └── MissingPackageError     an optional package; the message carries the command that installs it
 
 A message is one line: «expected X, but got Y», with the file and the channel named, and the fix.
@@ -16,6 +17,7 @@ A message is one line: «expected X, but got Y», with the file and the channel 
 __all__ = [
     "ChannelError",
     "DenoiserError",
+    "DeviceError",
     "FileError",
     "FrameError",
     "MissingPackageError",
@@ -46,6 +48,10 @@ class SettingsError(SelfcorrectError):
 
 class DenoiserError(SelfcorrectError):
     """A denoiser is unknown, does not fit its input, or failed."""
+
+
+class DeviceError(SelfcorrectError):
+    """A device cannot hold what it is asked to work on."""
 
 
 class MissingPackageError(SelfcorrectError):

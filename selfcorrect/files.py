@@ -112,7 +112,11 @@ def load(sources: Sources) -> Loaded:
         taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
     if sources.denoised_full:
         pairs["denoised_full"] = _color_of(sources.denoised_full, (height, width))
-    return Loaded(Frame(**pairs), Origin(sources.a, taken, stamp))
+    try:
+        frame = Frame(**pairs)
+    except FrameError as error:
+        raise FrameError(f"{sources.a} (half a), {sources.b} (half b): {error}") from None
+    return Loaded(frame, Origin(sources.a, taken, stamp))
 
 
 class _Half(NamedTuple):

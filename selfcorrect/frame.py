@@ -11,7 +11,7 @@ from torch import Tensor
 from selfcorrect.buffers import BUFFERS, COLOR, DENOISED, FEATURES, Buffer
 from selfcorrect.errors import FrameError
 from selfcorrect.image.bands import bands
-from selfcorrect.image.repair import Repairs, as_tensor, repair
+from selfcorrect.image.repair import Repairs, as_tensor, check_finite, repair
 
 __all__ = ["Candidate", "DualDenoiser", "Frame", "Half", "checked", "mean", "prefiltered"]
 
@@ -64,9 +64,9 @@ class Frame:
 
     Every buffer is a pair of (H, W, C) float arrays, NumPy or torch; (H, W) will do for one channel. They become
     float32 tensors; G-buffers of half floats stay what they are, and take half the memory. A tensor that needs no
-    change is not copied. Pixels that are NaN or infinite are filled from their finite neighbours, negative radiance
-    is clipped at 0 (as published), and both are counted in ``repairs``. A G-buffer that is the same at every pixel
-    says nothing and only costs time: it becomes None, and its name is in ``constant``.
+    change is not copied. Values that are NaN or infinite are filled from the finite ones around them in their channel,
+    negative radiance is clipped at 0 (as published), and the pixels of both are counted in ``repairs``. A G-buffer that
+    is the same at every pixel says nothing and only costs time: it becomes None, and its name is in ``constant``.
 
     Args:
         color: noisy linear radiance, 3 channels, ≥ 0.
@@ -79,7 +79,8 @@ class Frame:
         more: further images of the frame that the guard may blend in, finite and ≥ 0.
 
     Raises:
-        FrameError: sizes or channel counts do not fit.
+        FrameError: sizes or channel counts do not fit, or a channel of radiance is NaN or infinite at more than half
+            of its pixels.
     """
 
     color: Pair
@@ -259,7 +260,7 @@ def checked(
         size: height and width to have; None takes those of the first.
 
     Raises:
-        FrameError: a size or channel count does not fit.
+        FrameError: a size or channel count does not fit, or a channel of radiance is hardly finite.
     """
     tensors, counts = [], Repairs(0, 0)
     for what, array in zip(names, arrays, strict=True):
@@ -270,6 +271,8 @@ def checked(
                 f"but got {tensor.shape[1]}x{tensor.shape[0]}"
             )
         size = (tensor.shape[0], tensor.shape[1])
+        if buffer.kind == "radiance":
+            check_finite(tensor, what)
         tensor, repairs = repair(tensor, radiance=buffer.kind == "radiance")
         tensors.append(tensor)
         counts = Repairs(*(x + y for x, y in zip(counts, repairs, strict=True)))

@@ -60,6 +60,8 @@ class Estimate:
         change: corrected over denoised, minus 1; negative is better.
         standard_error: of ``change``.
         improved: whether the evidence says that the output is better; if not, the output is the denoised image.
+        independent: whether the halves can tell at all; if not, the output is the denoised image and no number is told:
+            all are 0.
     """
 
     noisy: float
@@ -68,8 +70,11 @@ class Estimate:
     change: float
     standard_error: float
     improved: bool
+    independent: bool = True
 
     def __str__(self) -> str:
+        if not self.independent:
+            return "relMSE unknown: the halves share their noise, the denoised image is kept; use another seed for one"
         if not self.improved:
             return f"relMSE ≈ {self.denoised:.3g}: the evidence shows no gain, the denoised image is kept"
         errors = f"{self.denoised:.3g} → {self.corrected:.3g}"

@@ -166,7 +166,8 @@ def test_nothing_finite_at_all(names: tuple[str, ...], halves: str, value: float
     for name in names:
         for half, _ in enumerate(halves):
             buffers[name][half][:] = value
-    corrected(Frame(**buffers))
+    with pytest.raises(FrameError, match=f"channel R of {names[0]} of half a, but got NaN or infinity at 3072 of 3072"):
+        Frame(**buffers)
 
 
 # --- Other values -------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.synthetic import (
     BALANCED,
-    EQUIVARIANCE,
     SIZE,
     Array,
     Pair,
@@ -17,6 +16,7 @@ from helpers.synthetic import (
     swapped,
     twice,
 )
+from helpers.tolerances import SWAPPED
 
 import denoisers
 from selfcorrect import Frame, Settings
@@ -67,7 +67,7 @@ def test_swapped_halves() -> None:
     color, albedo = noisy(scene()), noisy(scene(), 0.1, seed=5)
     image = corrected(boxed(color, albedo=albedo)).image
     other = corrected(boxed(swapped(color), albedo=swapped(albedo))).image
-    assert np.abs(other - image).max() < EQUIVARIANCE * image.mean()
+    assert np.abs(other - image).max() < SWAPPED * image.mean()
 
 
 def test_the_same_samples_in_both_halves() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from selfcorrect import Frame
@@ -72,9 +72,33 @@ def test_broken_pixels_are_filled_from_their_neighbours() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_nothing_finite_gives_black(value: float) -> None:
-    frame = Frame(color=tuple(np.full((5, 7, 3), value, np.float32) for _ in "ab"))
-    assert frame.color[0].eq(0).all()
+@pytest.mark.parametrize("channel", range(3))
+def test_a_channel_that_is_hardly_finite_is_refused(value: float, channel: int) -> None:
+    good, bad = pair((6, 8, 3))
+    bad[..., channel] = value
+    letter = "RGB"[channel]
+    with pytest.raises(FrameError, match=f"channel {letter} of color of half b, but got NaN or infinity at 48 of 48"):
+        Frame(color=(good, bad))
+    bad[:3, :, channel] = 1
+    assert Frame(color=(good, bad)).repairs["color"].non_finite == 24
+    bad[0, 0, channel] = value
+    with pytest.raises(FrameError, match="at 25 of 48"):
+        Frame(color=(good, bad))
+
+
+def test_a_channel_is_repaired_without_the_others() -> None:
+    a, b = pair((6, 8, 3))
+    a[2:4, :, 0] = np.nan
+    repaired = Frame(color=(a, b)).color[0].numpy()
+    assert np.array_equal(repaired[..., 1:], a[..., 1:])
+    assert np.isfinite(repaired).all()
+    assert repaired[..., 0].max() <= np.nanmax(a[..., 0])
+
+
+def test_depth_may_be_infinite_where_nothing_was_hit() -> None:
+    depth = pair((6, 8, 1))
+    depth[0][:5], depth[1][:5] = np.inf, np.inf
+    assert Frame(color=pair((6, 8, 3)), depth=depth).depth is not None
 
 
 @settings(max_examples=60, deadline=None)
@@ -91,6 +115,7 @@ def test_filling_stays_within_the_range_of_what_is_known(
     generator = np.random.default_rng(seed)
     color = generator.random((height, width, 3), dtype=np.float32)
     color[generator.random((height, width)) < share] = value
+    assume(np.isfinite(color[..., 0]).mean() >= 0.5)
     repaired = Frame(color=(color, color)).color[0]
     assert repaired.isfinite().all()
     assert repaired.min() >= 0

@@ -28,6 +28,7 @@ _OIDN = 0.2 * GIB  # its weights and buffers beside the scratch that it is told 
 _LEAST_SCRATCH = 0.4 * GIB  # its smallest tile takes 0.34 GiB
 _BYTES = {0: 4, 1: 2, 2: 4}  # uint, half, float
 _RGB = 12  # bytes of a pixel of three float32 channels
+_CANDIDATES = 2  # OIDN's other modes
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
@@ -95,11 +96,13 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
     trained = sum((b - t) * (r - x) for t, x, b, r in crops((height, width), settings, torch.Generator())) or pixels
     training = 1.2 * trained * 2 * 4 * (planes + 1)  # of both halves; 1.2: margins
     beyond = extra * image
-    evidence = pixels * 16 if settings.guard else 0
+    further = _CANDIDATES if settings.guard and settings.candidates != "none" else 0
+    candidates = 3 * image * further  # of both halves and of their mean
+    evidence = pixels * 8 * (1 + further + (1 + further) * (2 + further) // 2) if settings.guard else 0
     return Needs(
         read=_BASE + half + held + max(stored, half) + beyond,
-        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * beyond,
-        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * beyond,
+        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * beyond + candidates,
+        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * beyond + candidates,
         write=_BASE + _WORK + 2 * image + held + max(stored, held),
     )
 

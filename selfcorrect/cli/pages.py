@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,14 @@ from typing import Any
 from selfcorrect import exr, report
 from selfcorrect.correct import Result
 from selfcorrect.errors import SelfcorrectError
-from selfcorrect.frame import Frame, mean
+from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
 from selfcorrect.publish import publish
 from selfcorrect.report.shot import looked_at
 from selfcorrect.settings import Settings
 from selfcorrect.shot.run import Outcome
 
-__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "add_flag", "facts_of", "target", "write"]
+__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "add_flag", "facts_of", "images_of", "target", "write"]
 
 MAPS = ("error.before", "error.after", "blend")
 """Of a result's maps, in the order of the page."""
@@ -76,9 +76,10 @@ def _estimate(found: Any) -> dict[str, Any] | None:
     return {name: found[name] for name in names}
 
 
-def _images(frame: Frame, corrected: Any) -> dict[str, Any]:
-    denoised = frame.candidates[0].full
-    return {"noisy": mean(frame.color), "denoised": denoised, "corrected": corrected}
+def images_of(frame: Frame, corrected: Any) -> dict[str, tuple[Any, ...]]:
+    """What is to be looked at: name → images whose mean it is."""
+    denoised = frame.denoised if frame.denoised_full is None else (frame.denoised_full,)
+    return {"noisy": frame.color, "denoised": denoised or (), "corrected": (corrected,)}
 
 
 class FramePage:
@@ -97,13 +98,25 @@ class FramePage:
 
     def gather(self, frame: Frame, result: Result) -> None:
         """Keep what is to be looked at."""
-        self._images = {name: report.shrunk(image) for name, image in _images(frame, result.image).items()}
+        self._images = {name: report.shrunk(*parts) for name, parts in images_of(frame, result.image).items()}
         self._maps = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
 
     def write(self, facts: Mapping[str, Any]) -> None:
         """Write the page; ``facts`` are what --json prints."""
         title = Path(facts["output"]).name
         write(self._page, report.frame_page(self._images, self._maps, {**facts, "title": title}))
+
+
+def _summed(given: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Numbers by name, or by name and name, summed over frames."""
+    total: dict[str, Any] = {}
+    for one in given:
+        for name, value in one.items():
+            if isinstance(value, Mapping):
+                total[name] = _summed([total.get(name, {}), value])
+            else:
+                total[name] = total.get(name, 0) + value
+    return total
 
 
 class ShotPage:
@@ -125,14 +138,14 @@ class ShotPage:
         """What keeps a frame of this number."""
 
         def keep(frame: Frame, result: Result) -> None:
-            images = _images(frame, result.image)
+            images = images_of(frame, result.image)
             kept: dict[str, Any] = {
-                "thumbnail": report.thumbnail(images["corrected"]),
-                "rows": {name: report.slice_of(image) for name, image in images.items()},
+                "thumbnail": report.thumbnail(*images["corrected"]),
+                "rows": {name: report.slice_of(*parts) for name, parts in images.items()},
             }
             if number in self._kept:
-                kept["images"] = {name: report.shrunk(image) for name, image in images.items()}
-                kept["maps"] = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
+                kept["images"] = {name: report.still(*parts) for name, parts in images.items()}
+                kept["maps"] = {name: report.still(result.maps[name]) for name in MAPS if name in result.maps}
             self._pictures[number] = kept
 
         return keep
@@ -152,6 +165,7 @@ class ShotPage:
     def write(self, title: str, settings: Settings, more: Mapping[str, Any]) -> None:
         """Write the page, of the frames there are; ``more`` is what all of them share."""
         written = [frame.facts for frame in self._frames if frame.outcome == "written"]
+        totals = {name: _summed(facts[name] for facts in written) for name in ("seconds", "repairs")} if written else {}
         shared = {name: written[0][name] for name in ("channels", "threads", "version") if written}
-        facts = {"title": Path(title).name, "settings": settings.to_dict(), **shared, **more}
+        facts = {"title": Path(title).name, "settings": settings.to_dict(), **shared, **totals, **more}
         write(self._page, report.shot_page(self._frames, facts))

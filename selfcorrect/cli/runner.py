@@ -86,6 +86,11 @@ class Runner:
                 spec: denoisers.create(spec, threads=options.threads, scratch=scratch)
                 for spec in denoisers.variants(self._spec)
             }
+        if torch.device(options.device).type != "cpu":
+            bound = [stage.name for stage in self._stages if stage.on_cpu]
+            bound += [] if self._denoise is None else [f"the denoiser {self.denoiser}"]
+            if bound:
+                log(f"{' and '.join(bound)}: on the CPU; all else on {options.device}")
 
     @property
     def denoiser(self) -> str:
@@ -212,9 +217,9 @@ def _use_machine(options: argparse.Namespace) -> None:
             raise SettingsError(f"expected --threads of at least 1, but got {options.threads}")
         torch.set_num_threads(options.threads)
     try:
-        torch.empty(0, device=options.device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
+        torch.zeros(1, device=options.device, dtype=torch.float64).cpu()  # the guard's; MPS has none
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0].partition(". ")[0]
         raise SettingsError(
             f"expected a --device that this machine has, but got {options.device!r}: {reason}"
         ) from None

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError
 
-__all__ = ["Repairs", "as_tensor", "repair", "repaired"]
+__all__ = ["Repairs", "as_tensor", "check_finite", "repair", "repaired"]
+
+_MOST_REPAIRED = 0.5  # share of a radiance channel's pixels: with more, what is filled in is no render
 
 
 class Repairs(NamedTuple):
@@ -52,10 +54,21 @@ def as_tensor(array: Any, what: str, channels: int, *, half: bool) -> Tensor:
     return tensor if half and tensor.dtype == torch.float16 else tensor.float()
 
 
+def check_finite(image: Tensor, what: str) -> None:
+    """Raise a FrameError where a channel of radiance (H, W, 3) holds too few finite values to be filled from."""
+    pixels = image.shape[0] * image.shape[1]
+    for channel, broken in zip("RGB", (~image.isfinite()).sum((0, 1)).tolist(), strict=True):
+        if broken > _MOST_REPAIRED * pixels:
+            raise FrameError(
+                f"expected finite radiance at {1 - _MOST_REPAIRED:.0%} of the pixels or more in channel {channel} of "
+                f"{what}, but got NaN or infinity at {broken} of {pixels}; render it again"
+            )
+
+
 def repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:
     """The image filled where it is not finite, radiance clipped at 0; a tensor that needs no change is not copied."""
-    finite = image.isfinite().all(-1)
-    broken = int((~finite).sum())
+    finite = image.isfinite()
+    broken = int((~finite.all(-1)).sum())
     if broken:
         image = _fill(image.float(), finite).to(image.dtype)
     negative = int((image < 0).any(-1).sum()) if radiance else 0
@@ -65,11 +78,11 @@ def repair(image: Tensor, *, radiance: bool) -> tuple[Tensor, Repairs]:
 
 
 def _fill(image: Tensor, known: Tensor) -> Tensor:
-    """Fill unknown pixels from the known ones around them, nearer ones first (push-pull); all unknown gives 0."""
-    weight = known.to(image.dtype)[None, None]
-    value = torch.where(known[..., None], image, 0.0).permute(2, 0, 1)[None]
+    """Fill unknown values from those of the channel around them, nearer ones first (push-pull); all unknown gives 0."""
+    weight = known.to(image.dtype).permute(2, 0, 1)[None]
+    value = torch.where(known, image, 0.0).permute(2, 0, 1)[None]
     filled = _push_pull(value, weight)[0].permute(1, 2, 0)
-    return torch.where(known[..., None], image, filled)
+    return torch.where(known, image, filled)
 
 
 def _push_pull(value: Tensor, weight: Tensor) -> Tensor:

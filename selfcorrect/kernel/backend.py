@@ -1,7 +1,8 @@
 """Which form of a kernel runs: the one question about the device, asked at every call.
 
-Every kernel's folder has its forms beside one another, one signature: ``reference.py``, plain torch, and ``cpu.py``,
-compiled. Its ``__init__.py`` validates, asks :func:`choose`, and calls that form.
+Every kernel's folder has its forms beside one another, one signature: ``reference.py``, plain torch, ``cpu.py``,
+compiled, and where there is one ``gpu.py``, for CUDA. Its ``__init__.py`` validates, asks :func:`choose`, and calls
+that form.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from selfcorrect.kernel import _cpu
 
 __all__ = ["BACKENDS", "choose", "instruction_set", "instruction_sets"]
 
-BACKENDS = ("cpu", "reference")
+BACKENDS = ("cpu", "gpu", "reference")
 
 
 def choose(
@@ -24,15 +25,18 @@ def choose(
     dtypes: Sequence[torch.dtype] = (torch.float32,),
     fits: bool = True,
     limit: str = "",
+    gpu: bool = False,
 ) -> str:
     """The name of the form that these tensors are computed with.
 
     Args:
         backend: one of :data:`BACKENDS`; by default the compiled form where it can compute this, else the reference.
+            "gpu" asked for on the CPU is Triton's interpreter, for tests, or an error of Triton's.
         tensors: what is computed with.
         dtypes: that the compiled form takes, or turns into float32 itself.
         fits: whether the compiled form can compute it as far as the kernel itself is concerned.
         limit: what that asks for, in words.
+        gpu: whether there is a form for CUDA; it takes float32.
 
     Raises:
         SettingsError: there is no such form, or it cannot compute with these tensors.
@@ -40,15 +44,22 @@ def choose(
     kinds = sorted({f"{tensor.dtype} on {tensor.device.type}".removeprefix("torch.") for tensor in tensors})
     compiled = fits and all(tensor.device.type == "cpu" and tensor.dtype in dtypes for tensor in tensors)
     if backend is None:
-        return "cpu" if compiled else "reference"
-    if backend not in BACKENDS:
-        raise SettingsError(f"expected a backend out of {', '.join(BACKENDS)}, but got {backend!r}")
+        return "cpu" if compiled else "gpu" if gpu and _on_cuda(tensors) else "reference"
+    offered = [name for name in BACKENDS if gpu or name != "gpu"]
+    if backend not in offered:
+        raise SettingsError(f"expected a backend out of {', '.join(offered)}, but got {backend!r}")
     if backend == "cpu" and not compiled:
         taken = " or ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
         wanted = f"{taken} on cpu" + (f" and {limit}" if limit else "")
         got = ", ".join(kinds) + ("" if fits else " and more")
         raise SettingsError(f"expected {wanted} for the backend cpu, but got {got}; leave the backend to be chosen")
     return backend
+
+
+def _on_cuda(tensors: Sequence[Tensor]) -> bool:
+    """ROCm calls itself cuda too; what is compiled for it has never been looked at."""
+    on_device = all(tensor.device.type == "cuda" and tensor.dtype == torch.float32 for tensor in tensors)
+    return on_device and torch.version.hip is None
 
 
 def instruction_sets() -> list[str]:

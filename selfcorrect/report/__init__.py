@@ -7,6 +7,16 @@ head forbids it any; images are linear radiance as half floats, exposed and tone
 from selfcorrect.report.bench import bench_page
 from selfcorrect.report.frame import frame_page
 from selfcorrect.report.pack import LARGEST_PAGE, shrunk
-from selfcorrect.report.shot import ShotFrame, shot_page, slice_of, thumbnail
+from selfcorrect.report.shot import ShotFrame, shot_page, slice_of, still, thumbnail
 
-__all__ = ["LARGEST_PAGE", "ShotFrame", "bench_page", "frame_page", "shot_page", "shrunk", "slice_of", "thumbnail"]
+__all__ = [
+    "LARGEST_PAGE",
+    "ShotFrame",
+    "bench_page",
+    "frame_page",
+    "shot_page",
+    "shrunk",
+    "slice_of",
+    "still",
+    "thumbnail",
+]

@@ -45,7 +45,7 @@ def bench_page(
         summary=f"<p class='headline'>{escape(_summary(told))}.</p>",
         body='<section id="pareto" aria-label="Seconds against error"></section>'
         + section("Points", _table(points, told)),
-        data={"kind": "bench", "points": told},
+        data={"points": told},
         scripts=("pareto.js",),
     )
 
@@ -65,6 +65,7 @@ def _table(points: Sequence[Mapping[str, Any]], told: Sequence[Mapping[str, Any]
     for one, plain in sorted(zip(points, told, strict=True), key=lambda pair: pair[1]["seconds"]):
         marks = [word for word in ("front", "preset", "recommended") if plain[word]]
         deviation = f"{one['ratio']:.3f} ± {one['standard_error']:.3f}"
-        rows.append((one["point"], one["train"], one["infer"], plain["seconds"], deviation, ", ".join(marks)))
+        seconds = [f"{value:.2f}" for value in (one["train"], one["infer"], plain["seconds"])]
+        rows.append((one["point"], *seconds, deviation, ", ".join(marks)))
     head = ("point", "train, s", "infer, s", "seconds", "error over denoised", "")
     return table("Estimated without a reference; the quickest first", head, rows, "numbers points")

@@ -11,6 +11,7 @@ class Viewer {
     this.left = this.right = null;
     this.cursor = null;
     this.scale = 1;
+    this.origin = [0, 0];
     this.listeners = [];
     this.build(root);
   }
@@ -37,7 +38,7 @@ class Viewer {
     this.divider = this.dividerElement();
     this.legend = make("div", { class: "legend" });
     this.inspector = make("div", { class: "inspector" });
-    const keys = [["1 – 9", "images"], ["space", "flips between the last two"], ["s o g", "slider, one image, side by side"], ["[ ]", "exposure"], ["+ −", "zoom"], ["0", "fit"], ["arrows", "move"]];
+    const keys = [["1 – 9", "images"], ["space", "flips between the last two"], ["s o g", "slider, one image, side by side"], ["[ ]", "exposure"], ["+ −", "zoom, like the wheel after a click"], ["0", "fit"], ["arrows", "move"]];
     const hint = make("p", { class: "hint keys" }, ...keys.flatMap(([key, does]) => [make("kbd", {}, key), ` ${does} `]));
     const remark = [...root.children];
     root.append(
@@ -76,10 +77,16 @@ class Viewer {
     return divider;
   }
   /** Show other images in the same view, as another frame of a shot. */
-  load(layers, scale) {
+  load(layers, scale, origin = [0, 0]) {
+    const size = (some) => [...some.values()].slice(0, 1).map(({ width, height }) => `${width} ${height}`).join();
     const first = !this.layers.size;
+    if (size(layers) !== size(this.layers)) {
+      this.view.fit = true;
+      this.cursor = null;
+    }
     this.layers = layers;
     this.scale = scale;
+    this.origin = origin;
     const names = [...layers.keys()];
     if (!layers.has(this.left)) this.left = layers.has("denoised") ? "denoised" : names[0];
     if (!layers.has(this.right)) this.right = layers.has("corrected") ? "corrected" : names[names.length - 1];
@@ -195,7 +202,8 @@ class Viewer {
       const told = layer.colours === "signed" ? [percent(values[0], 1)] : values.map(short);
       return make("tr", {}, make("th", { scope: "row" }, ...(layer instanceof Picture ? [swatch] : []), layer.label), ...told.map((v) => make("td", {}, v)));
     });
-    const where = this.scale === 1 ? `Pixel ${x}, ${y}` : `Pixel about ${Math.round((x + 0.5) * this.scale)}, ${Math.round((y + 0.5) * this.scale)} of the frame`;
+    const [left, top] = this.origin, at = [[x, left], [y, top]].map(([v, from]) => Math.floor(from + (v + 0.5) * this.scale));
+    const where = `Pixel ${this.scale === 1 ? "" : "about "}${at.join(", ")}`;
     const head = ["", "red", "green", "blue"].map((name) => make("th", { scope: "col" }, name));
     this.inspector.replaceChildren(make("table", {},
       make("caption", {}, `${where}${this.cursor ? "" : " (middle)"}, linear`),

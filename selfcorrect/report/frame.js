@@ -1,7 +1,20 @@
-// A frame: its layers in the viewer.
+// A frame: its layers in the viewer, and where it is shown reduced, the region that was changed most as it is.
 
 const viewer = new Viewer(document.getElementById("viewer"));
-layersOf(data.layers).then((layers) => {
-  viewer.load(layers, data.scale);
+const regions = [{ label: "Whole frame, reduced", left: 0, top: 0, ...data }];
+if (data.detail) regions.push({ label: "Most changed, every pixel", ...data.detail });
+const buttons = regions.map((region) => make("button", { type: "button", onclick: () => open(region) }, region.label));
+if (regions.length > 1) {
+  const group = make("div", { class: "group", role: "group", "aria-label": "Region" }, make("span", { class: "name" }, "Region"), ...buttons);
+  document.getElementById("viewer").prepend(make("div", { class: "bar" }, group));
+}
+
+async function open(region) {
+  region.unpacked ??= layersOf(region.layers);
+  viewer.load(await region.unpacked, region.scale, [region.left, region.top]);
+  buttons.forEach((button, i) => button.setAttribute("aria-pressed", regions[i] === region));
+}
+
+open(regions[0]).then(() => {
   document.documentElement.dataset.ready = "true";
 });

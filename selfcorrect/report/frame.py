@@ -8,7 +8,7 @@ import numpy as np
 
 from selfcorrect.report import words
 from selfcorrect.report.html import assembled, facts_sections, section
-from selfcorrect.report.pack import LARGEST_PAGE, Packed, fitted
+from selfcorrect.report.pack import LARGEST_PAGE, Packed, fitted, reduced
 
 __all__ = ["LABELS", "errors", "frame_page", "layers", "note", "viewer"]
 
@@ -22,6 +22,7 @@ LABELS = {
     "blend": "Blend weight",
 }
 _ROOM = 300_000  # bytes for all that is no image
+_DETAIL, _DETAIL_SIDE = 0.2, 320  # share of the bytes, and side in pixels, of a region that is kept as it is
 
 
 def frame_page(
@@ -35,15 +36,19 @@ def frame_page(
         maps: (H, W): ``error.before`` and ``error.after`` (relative squared error), ``blend`` (0 … 1), or none.
         facts: what the command prints with --json, as far as it is known; ``title`` names the page, ``relmse`` holds
             errors against the reference by image.
-        limit: largest page, in bytes. Frames that do not fit are rounded, then reduced; the page says so.
+        limit: largest page, in bytes. Frames that do not fit are rounded, then reduced, and the region that was changed
+            most is kept as it is; the page says so.
 
     Returns:
         HTML that needs no other file.
     """
-    budget = limit - _ROOM
-    packed = fitted({**images, **maps}, budget)
-    first = next(iter(images.values()))
-    full = facts.get("size") or {"width": np.asarray(first).shape[1], "height": np.asarray(first).shape[0]}
+    budget, shown_all = limit - _ROOM, {**images, **maps}
+    height, width = next(iter(images.values())).shape[:2]
+    full = facts.get("size") or {"width": width, "height": height}
+    packed, detail = fitted(shown_all, budget), None
+    if next(iter(packed.values())).width < width:
+        packed = fitted(shown_all, int((1 - _DETAIL) * budget))
+        detail = _detail(shown_all, full["width"] / width, int(_DETAIL * budget))
     shown = next(iter(packed.values()))
     place = ""
     if {"error.before", "error.after"} <= set(maps) and "denoised" in images:
@@ -53,7 +58,7 @@ def frame_page(
         lead=_lead(facts, full),
         summary=f"<p class='headline'>{escape(words.summary(facts.get('estimate'), place))}.</p>{errors(facts)}",
         body=viewer(note(full, shown)) + section("What was done", facts_sections(facts)),
-        data={"kind": "frame", "scale": full["width"] / shown.width, "layers": layers(packed)},
+        data={"scale": full["width"] / shown.width, "layers": layers(packed), "detail": detail},
         scripts=("viewer.js", "controls.js", "frame.js"),
     )
 
@@ -67,6 +72,21 @@ def _lead(facts: Mapping[str, Any], size: Mapping[str, int]) -> str:
     if total := (facts.get("seconds") or {}).get("total"):
         parts.append(f"{total:.1f} s")
     return " · ".join(parts)
+
+
+def _detail(images: Mapping[str, Any], scale: float, budget: int) -> dict[str, Any] | None:
+    """The square that the correction has changed most, for JSON; None where it takes more than there is room for."""
+    if not {"denoised", "corrected"} <= set(images):
+        return None
+    before, after = (words.luminance(images[name]) for name in ("denoised", "corrected"))
+    changed = reduced(np.abs(after - before) / (before + 0.1), _DETAIL_SIDE)
+    row, column = np.unravel_index(int(changed.argmax()), changed.shape)
+    top, left = int(row) * _DETAIL_SIDE, int(column) * _DETAIL_SIDE
+    square = slice(top, top + _DETAIL_SIDE), slice(left, left + _DETAIL_SIDE)
+    packed = fitted({name: image[square] for name, image in images.items()}, budget)
+    if next(iter(packed.values())).width < next(iter(images.values()))[square].shape[1]:
+        return None
+    return {"scale": scale, "left": left * scale, "top": top * scale, "layers": layers(packed)}
 
 
 def layers(packed: Mapping[str, Packed]) -> list[dict[str, Any]]:

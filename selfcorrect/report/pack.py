@@ -7,7 +7,7 @@ what is left over is small and deflates well. pixels.js undoes it, bit by bit.
 
 import base64
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,8 @@ LARGEST_PAGE = 8_000_000
 """Bytes of a page."""
 
 _KEPT_PIXELS = 1 << 21  # of an image that waits for its page: no page could hold more
-_LARGEST_HALF = 0x7BFF  # 65504
+_BAND = 256  # rows that are worked on at once
+_LARGEST, _LARGEST_HALF = 65504.0, 0x7BFF
 _MANTISSA = 10  # bits
 _ROUNDED = 7  # bits of mantissa where they must do: steps of 0.8 %, what 8 bits of sRGB show at white
 _LEAST = 0.4  # bytes that a number takes at best, to spare trials that cannot fit
@@ -64,8 +65,8 @@ def pack(image: Any, bits: int = _MANTISSA) -> Packed:
 
 
 def _integers(planes: Array, bits: int) -> NDArray[np.int32]:
-    finite = np.nan_to_num(planes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
-    half = np.clip(finite, 0, 65504).astype(np.float16).view(np.uint16).astype(np.int32)
+    finite = np.nan_to_num(planes.astype(np.float32), nan=0.0, posinf=_LARGEST, neginf=0.0)
+    half = np.clip(finite, 0, _LARGEST).astype(np.float16).view(np.uint16).astype(np.int32)
     dropped = _MANTISSA - bits
     rounded: NDArray[np.int32] = np.minimum((half + (1 << dropped >> 1)) >> dropped, _LARGEST_HALF >> dropped)
     return rounded
@@ -94,18 +95,24 @@ def reduced(image: Any, factor: int) -> Array:
     return values
 
 
-def shrunk(image: Any, pixels: int = _KEPT_PIXELS) -> Array:
-    """A copy for a page: float16, of so many pixels at most; (H, W, 3) or (H, W), an array or a tensor on any device.
+def shrunk(*images: Any, pixels: int = _KEPT_PIXELS) -> Array:
+    """A copy for a page: float16, of so many pixels at most; (H, W, 3) or (H, W), of arrays or tensors on any device.
 
-    Images of one size come out as large as one another.
+    Of several images it is the mean. What has one size comes out in one size. No second copy in full is made.
     """
-    values = np.asarray(image.detach().cpu() if hasattr(image, "detach") else image)
-    height, width = values.shape[:2]
+    height, width = images[0].shape[:2]
     factor = 1
     while -(-height // factor) * -(-width // factor) > pixels:
         factor += 1
-    small = values if factor == 1 else reduced(np.nan_to_num(np.clip(values, 0, 65504)), factor)
-    kept: Array = np.clip(small, 0, 65504).astype(np.float16)
+    rows = factor * max(1, _BAND // factor)
+    bands = [_band([image[top : top + rows] for image in images], factor) for top in range(0, height, rows)]
+    return np.concatenate(bands)
+
+
+def _band(images: Sequence[Any], factor: int) -> Array:
+    plain = [np.asarray(image.detach().cpu() if hasattr(image, "detach") else image) for image in images]
+    finite = [np.nan_to_num(np.clip(one.astype(np.float32), 0, _LARGEST)) for one in plain]
+    kept: Array = np.clip(reduced(sum(finite) / len(finite), factor), 0, _LARGEST).astype(np.float16)
     return kept
 
 

@@ -29,7 +29,7 @@ function within(limit) {
 function ticks(low, high) {
   const found = [];
   for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power++) {
-    for (const digit of [1, 2, 5]) {
+    for (const digit of high / low < 8 ? [1, 1.5, 2, 3, 4, 5, 7] : [1, 2, 5]) {
       const value = digit * 10 ** power;
       if (value >= low && value <= high) found.push(value);
     }
@@ -62,7 +62,7 @@ function draw() {
   svg.append(line("one", left, y(1), width - right, y(1)), line("budget", x(budget), top, x(budget), height - bottom));
   const front = points.filter((p) => p.front);
   svg.append(make("svg:path", { class: "front", d: front.map((p, i) => (i ? `H${x(p.seconds)}V${y(p.ratio)}` : `M${x(p.seconds)},${y(p.ratio)}`)).join("") }));
-  const labels = [];
+  const labels = points.map((p) => [x(p.seconds) - 5, y(p.ratio) - 5, 10, 10]);
   for (const p of points) svg.append(...mark(p, x, y, labels, width - right));
   plot.replaceChildren(svg);
   choose(chosen);
@@ -77,11 +77,11 @@ function mark(p, x, y, labels, end) {
   });
   const found = [make("svg:line", { class: `whisker${beyond}`, x1: x(p.seconds), x2: x(p.seconds), y1: y(p.ratio + p.error), y2: y(p.ratio - p.error) }), dot];
   const wide = 7 * p.name.length, back = x(p.seconds) + 10 + wide > end;
-  const box = [x(p.seconds) + (back ? -10 - wide : 10), y(p.ratio) - 12, wide, 14];
+  const box = [x(p.seconds) + (back ? -10 - wide : 10), y(p.ratio) - 18, wide, 12];
   const free = labels.every(([bx, by, bw, bh]) => box[0] > bx + bw || box[0] + box[2] < bx || box[1] > by + bh || box[1] + box[3] < by);
   if ((p.preset || p.front) && (free || p.preset)) {
     labels.push(box);
-    found.push(make("svg:text", { class: beyond.trim(), x: back ? box[0] + wide : box[0], y: y(p.ratio) - 2, "text-anchor": back ? "end" : "start" }, p.name));
+    found.push(make("svg:text", { class: beyond.trim(), x: back ? box[0] + wide : box[0], y: y(p.ratio) - 8, "text-anchor": back ? "end" : "start" }, p.name));
   }
   return found;
 }

@@ -12,11 +12,11 @@ from selfcorrect.report.frame import LABELS, layers, note, viewer
 from selfcorrect.report.html import assembled, facts_sections, section, table
 from selfcorrect.report.pack import LARGEST_PAGE, Array, fitted, pack, shrunk
 
-__all__ = ["ShotFrame", "looked_at", "shot_page", "slice_of", "thumbnail"]
+__all__ = ["ShotFrame", "looked_at", "shot_page", "slice_of", "still", "thumbnail"]
 
 _ROOM = 400_000  # bytes for all that is no image
 _STRIP, _SLICE = 0.2, 0.2  # shares of the images' bytes
-_THUMBNAIL, _ROW = 20_000, 640  # pixels at most, of a thumbnail and of a slice's width
+_THUMBNAIL, _STILL, _ROW = 20_000, 350_000, 640  # pixels at most; the last, of a slice's width
 _LOOKED_AT = 6  # frames
 
 
@@ -50,16 +50,20 @@ def looked_at(numbers: Sequence[int]) -> set[int]:
     return {numbers[round(i * (len(numbers) - 1) / (_LOOKED_AT - 1))] for i in range(_LOOKED_AT)}
 
 
-def thumbnail(image: Any) -> Array:
-    """An image small enough for the strip."""
-    return shrunk(image, _THUMBNAIL)
+def still(*images: Any) -> Array:
+    """An image or a map, or the mean of several, of a frame to be looked at, not larger than the page has room for."""
+    return shrunk(*images, pixels=_STILL)
 
 
-def slice_of(image: Any) -> Array:
-    """The middle row of an image, (W, 3) float16, of at most 640 pixels."""
-    row = shrunk(image[image.shape[0] // 2][None], _ROW)
-    narrow: Array = row[0]
-    return narrow
+def thumbnail(*images: Any) -> Array:
+    """An image, or the mean of several, small enough for the strip."""
+    return shrunk(*images, pixels=_THUMBNAIL)
+
+
+def slice_of(*images: Any) -> Array:
+    """The middle row of an image, or of the mean of several, (W, 3) float16, of at most 640 pixels."""
+    row: Array = shrunk(*(image[image.shape[0] // 2][None] for image in images), pixels=_ROW)[0]
+    return row
 
 
 def shot_page(frames: Sequence[ShotFrame], facts: Mapping[str, Any], *, limit: int = LARGEST_PAGE) -> str:
@@ -104,7 +108,7 @@ def shot_page(frames: Sequence[ShotFrame], facts: Mapping[str, Any], *, limit: i
         summary=f"<p class='headline'>{escape(_summary(frames))}.</p>",
         body='<section id="strip" aria-label="Frames of the shot"></section>'
         f'{viewer(remark)}<section id="slice" aria-label="A row through time"></section>{rest}',
-        data={"kind": "shot", "frames": told, "slices": slices, "labels": LABELS},
+        data={"frames": told, "slices": slices, "labels": LABELS},
         scripts=("viewer.js", "controls.js", "strip.js"),
     )
 

@@ -48,7 +48,7 @@ function gainChart() {
     const step = (width - left) / data.frames.length, every = Math.ceil(data.frames.length / ((width - left) / 44));
     const svg = make("svg:svg", { height, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `Gain of each frame, from ${known.map((f) => `${f.number}: ${gainOf(f)}`).join(", ")}` });
     for (const gain of [0, most / 2, most]) {
-      svg.append(make("svg:line", { class: "axis", x1: left, x2: width, y1: y(gain), y2: y(gain) }), make("svg:text", { class: "quiet", x: left - 6, y: y(gain) + 4, "text-anchor": "end" }, gain ? percent(-gain) : "0"));
+      svg.append(make("svg:line", { class: "axis", x1: left, x2: width, y1: y(gain), y2: y(gain) }), make("svg:text", { class: "quiet", x: left - 6, y: y(gain) + 4, "text-anchor": "end" }, gain ? percent(-gain, most < 0.2 ? 1 : 0) : "0"));
     }
     data.frames.forEach((frame, i) => {
       const gain = Math.max(0, -(frame.change ?? 0)), x = left + i * step, bar = Math.max(1, Math.min(40, step - 2));

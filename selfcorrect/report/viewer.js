@@ -149,6 +149,7 @@ class Stage {
     const at = split === null ? 0 : Math.round(split * w);
     if (split !== null) this.paint(context, left, 0, at, ratio);
     this.paint(context, right, at, w, ratio);
+    this.element.style.touchAction = this.viewer.view.fit ? "pan-y" : "none"; // a finger scrolls past what is not zoomed
     this.tags[0].textContent = split === null ? right.label : left.label;
     this.tags[1].textContent = split === null ? "" : right.label;
     this.tags[0].hidden = split !== null && split < 0.08;

@@ -19,7 +19,7 @@ _MOST = 0.5  # of the gain
 def summary(estimate: Mapping[str, Any] | None, place: str = "") -> str:
     """ "Error about 31 % lower, mostly in the highlights", from the guard's estimate and :func:`where`."""
     if estimate is None:
-        return "No estimate of the error: the guard was off"
+        return "No estimate of the error"
     if not estimate["improved"]:
         return KEPT
     gain = -100 * estimate["change"]

@@ -241,4 +241,7 @@ class DeepCombinerStage(Stage):
 
         size = (noisy[0].shape[0], noisy[0].shape[1])
         features = feature_planes(size, normal=feature("normal"), albedo=feature("albedo"), depth=feature("depth"))
-        return combine_whole(network, noisy, denoised, features, scale=scale, precision=self.settings.precision)
+        there = noisy[0].device
+        return combine_whole(
+            network.to(there), noisy, denoised, features.to(there), scale=scale, precision=self.settings.precision
+        )

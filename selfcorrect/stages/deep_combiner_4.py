@@ -109,4 +109,7 @@ class DeepCombiner4(DeepCombinerStage):
         if not isinstance(given, SubImages) or given.denoised is None:
             got = "such as are not denoised; call sub_images.denoise(frame, denoiser)" if given else "none"
             raise FrameError(f"expected four denoised sub-images for the stage {self.name}, but got {got}")
-        return self.combined(self.network_4, given.images, given.denoised, state.halves, state.scale)
+        noisy, denoised = (
+            [image.to(state.full.device) for image in images] for images in (given.images, given.denoised)
+        )
+        return self.combined(self.network_4, noisy, denoised, state.halves, state.scale)

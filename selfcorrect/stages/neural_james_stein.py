@@ -225,9 +225,10 @@ class NeuralJamesStein(Stage):
         """Shrink with what the network predicts."""
         scaled = state.scaled()
         variance = variance_of_mean(scaled.color)
+        network = self.network.to(state.full.device)
 
         def blended(noisy: Tensor, variance: Tensor, y_a: Tensor, y_b: Tensor) -> Tensor:
-            theta = blend_whole(self.network, noisy, variance, y_a, y_b, precision=self.settings.precision)
+            theta = blend_whole(network, noisy, variance, y_a, y_b, precision=self.settings.precision)
             return scale_(theta, 1 / state.scale)
 
         a, b = (blended(noisy, 2 * variance, y, y) for noisy, y in zip(scaled.color, scaled.images, strict=True))

@@ -94,6 +94,7 @@ class Regression(Stage):
     """
 
     name = "regression"
+    on_cpu = True
 
     def run(self, state: StageImages, work: Work) -> Outcome:
         """Fit at every ``regression_stride``-th pixel."""

@@ -118,12 +118,14 @@ class Stage(ABC):
     Attributes:
         name: in the settings' ``stages``.
         learns: on the frame itself, so that a warm start makes sense.
+        on_cpu: it works there, wherever the frame's buffers lie.
         first_only: it reads what the denoiser gave, so that no other stage may come before it.
         extra: images that it needs beyond the halves.
     """
 
     name: ClassVar[str]
     learns: ClassVar[bool] = False
+    on_cpu: ClassVar[bool] = False
     first_only: ClassVar[bool] = False
     extra: ClassVar[Extra | None] = None
 

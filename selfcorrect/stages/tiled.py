@@ -14,7 +14,7 @@ from torch import Tensor
 
 from selfcorrect.image.tiles import Region
 from selfcorrect.image.windows import reflect
-from selfcorrect.kernel.convolution import best_instruction_set
+from selfcorrect.kernel.convolution import has_fast_bf16
 
 __all__ = ["ALIGNMENT", "SIDE", "around", "autocast", "cut", "slices"]
 
@@ -49,7 +49,7 @@ def slices(region: Region) -> tuple[slice, slice]:
 
 
 def autocast(image: Tensor, precision: str) -> AbstractContextManager[object]:
-    """Bfloat16 where it is asked for and fast: other processors emulate it."""
-    if precision == "bf16" and image.device.type == "cpu" and best_instruction_set("bf16") == "amx":
-        return torch.autocast("cpu", torch.bfloat16)
+    """Bfloat16 where it is asked for and fast."""
+    if precision == "bf16" and has_fast_bf16(image.device):
+        return torch.autocast(image.device.type, torch.bfloat16)
     return nullcontext()

@@ -203,6 +203,8 @@ class TestBadInput:
             (["--denoiser", "none.py:Class"], "none.py"),
             (["--device", "nonsense"], "nonsense"),
             (["--device", "cuda"], "cuda"),
+            (["--device", "cuda:7"], "cuda:7"),
+            (["--device", "meta"], "meta"),
             (["--threads", "0"], "--threads"),
             (["--map", "albedo"], "ROLE=CHANNEL"),
             (["--map", "albedo=Nonsense"], "Nonsense"),

@@ -17,7 +17,6 @@ Pair = tuple[Any, Any]
 BALANCED = Settings.preset("balanced", steps=12, patch=32, batch=2, window=9)
 SIZE = (48, 64)
 MARGIN = 1.01  # of the denoised image's error, that an output may have
-EQUIVARIANCE = 1e-3  # of the mean; measured: 4e-6 for a factor, 5e-7 for swapped halves
 
 
 def scene(size: tuple[int, int] = SIZE) -> Array:

@@ -8,12 +8,16 @@ from torch import Tensor, nn
 from selfcorrect import Settings
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.kernel import convolution
-from selfcorrect.kernel.convolution import cpu
+from selfcorrect.kernel.convolution import cpu, gpu
 from selfcorrect.kernel.convolution import reference as in_torch
 from selfcorrect.kernel.convolution.cpu import convolutions
 from selfcorrect.stages.core.network import Network
 
 VARIANTS = cpu.instruction_sets()
+FORMS = [*VARIANTS, "gpu"]
+"""The CPU's compiled variants, and the form for CUDA, which is torch's and runs on the CPU where there is no device."""
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 SIZES = [(1, 1), (1, 17), (16, 1), (5, 7), (19, 19), (3, 130), (33, 65), (64, 64)]
 
 
@@ -69,6 +73,10 @@ def rounded_reference(network: Network, images: Tensor, upstream: Tensor) -> lis
 
 def compiled(network: Network, images: Tensor, upstream: Tensor, isa: str, threads: int = 2) -> list[Tensor]:
     parameters = list(network.parameters())
+    if isa == "gpu":
+        there = [p.detach().to(DEVICE).requires_grad_() for p in parameters]
+        raw = gpu.convolutions(list(images.to(DEVICE)), there, log_radiance=network.log_radiance)
+        return [x.cpu() for x in (raw.detach(), *torch.autograd.grad(raw, there, upstream.to(DEVICE)))]
     raw = convolutions(list(images), parameters, log_radiance=network.log_radiance, isa=isa, threads=threads)
     return [raw.detach(), *torch.autograd.grad(raw, parameters, upstream)]
 
@@ -92,19 +100,19 @@ def compare(network: Network, images: Tensor, isa: str) -> None:
     assert_close(compiled(network, images, upstream, isa), exact(network, images, upstream), dtype)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
+@pytest.mark.parametrize("isa", FORMS)
 @pytest.mark.parametrize("size", SIZES)
 def test_sizes(size: tuple[int, int], isa: str) -> None:
     compare(make_network(13, 15), random(3, 13, *size), isa)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
+@pytest.mark.parametrize("isa", FORMS)
 @pytest.mark.parametrize(("inputs", "heads"), [(3, 4), (6, 6), (7, 7), (10, 11), (13, 15), (16, 16)])
 def test_inputs_and_heads(inputs: int, heads: int, isa: str) -> None:
     compare(make_network(inputs, heads), random(2, inputs, 9, 21), isa)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
+@pytest.mark.parametrize("isa", FORMS)
 @pytest.mark.parametrize(("filters", "layers"), [(1, 2), (5, 3), (16, 12)])
 def test_filters_and_layers(filters: int, layers: int, isa: str) -> None:
     compare(make_network(6, 6, filters=filters, layers=layers), random(1, 6, 12, 10), isa)
@@ -229,3 +237,18 @@ def test_every_backend_gives_the_same() -> None:
         convolution.convolutions(images, list(make_network(6, 6, filters=17).parameters()), backend="cpu")
     with pytest.raises(FrameError, match="expected images of one shape"):
         convolution.convolutions([random(6, 9, 9), random(6, 9, 8)], parameters)
+
+
+def test_the_form_for_cuda_in_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hidden layers are rounded, weights and bias of the last layer are not; heads and gradients come in float32."""
+    monkeypatch.setattr(gpu, "has_fast_bf16", lambda device: True)
+    network, images = make_network(13, 15), random(2, 13, 17, 21)
+    upstream = random(2, 15, 17, 21, seed=3)
+    parameters = [p.detach().to(DEVICE).requires_grad_() for p in network.parameters()]
+    raw = gpu.convolutions(list(images.to(DEVICE)), parameters, precision="bf16")
+    got = [raw.detach(), *torch.autograd.grad(raw, parameters, upstream.to(DEVICE))]
+    assert all(x.dtype == torch.float32 for x in got)
+    for i, (x, expected) in enumerate(zip(got, reference(network, images, upstream), strict=True)):
+        norm, kind = torch.linalg.vector_norm, "convolution for CUDA" + " gradients" * bool(i)
+        difference = float(norm(x.cpu().double() - expected) / norm(expected))
+        assert 1e-4 < difference < TOLERANCE[torch.bfloat16][kind] or i == len(got) - 1, f"{kind} {i}: {difference:.2e}"

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from helpers.kernel import EVERY_SET, TOLERANCE, Terms, make_guides, make_raw, names, single, worst
+from helpers.kernel import ALWAYS, EVERY_SET, TOLERANCE, Terms, make_guides, make_raw, names, single, worst
 from torch import Tensor
 
 from selfcorrect.buffers import TERMS
@@ -13,26 +13,50 @@ from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.image.exposure import LARGEST
 from selfcorrect.kernel import _cpu
 from selfcorrect.kernel.backend import BACKENDS, instruction_sets
-from selfcorrect.kernel.cross_bilateral import Window, cpu, cross_bilateral, cross_bilateral_loss, reference
+from selfcorrect.kernel.cross_bilateral import Window, cpu, cross_bilateral, cross_bilateral_loss, gpu, reference
 from selfcorrect.kernel.guides import Guides
 
 SINGLE = TOLERANCE[torch.float32]
-VARIANTS = instruction_sets()
+BACKENDS_AND_SETS = [*instruction_sets(), "gpu"]
+"""The CPU's compiled variants, and the one for CUDA: in Triton's interpreter where there is no device."""
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+INTERPRETED = DEVICE == "cpu"
+TILE = (16, 32) if INTERPRETED else gpu.TILE  # the interpreter takes as long for a large one as for a small one
 ORIGIN = torch.zeros(1, 2, dtype=torch.int64)
 exact = partial(reference.cross_bilateral, taps_per_step=None)
 every_set = pytest.mark.parametrize("terms", EVERY_SET, ids=names)
 
 
-def compare(guides: Guides, raw: Tensor, corners: Tensor, window: Window, isa: str, case: str = "") -> None:
+def sides(usual: tuple[int, ...], interpreted: tuple[int, ...]) -> pytest.MarkDecorator:
+    """Every backend with windows of these sides; the interpreter, at 40 ms a tap, with those that it can bear."""
+    cases = [(b, s) for b in BACKENDS_AND_SETS for s in (interpreted if b == "gpu" and INTERPRETED else usual)]
+    return pytest.mark.parametrize(("backend", "side"), cases)
+
+
+def patches(backend: str, *corners: tuple[int, int]) -> Tensor:
+    """Corners (N, 2); for the interpreter, which takes patches one after the other, the last one."""
+    return torch.tensor(corners[-1:] if backend == "gpu" and INTERPRETED else corners)
+
+
+def leaf(backend: str, raw: Tensor) -> Tensor:
+    """The heads in float32, to be differentiated, where the backend wants them."""
+    return raw.float().to(DEVICE if backend == "gpu" else "cpu").requires_grad_()
+
+
+def compare(guides: Guides, raw: Tensor, corners: Tensor, window: Window, backend: str, case: str = "") -> None:
     """Values and the gradient of every head, under a random upstream gradient."""
     expected_raw = raw.clone().requires_grad_()
     expected = exact(guides, expected_raw, corners, window)
     upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     (expected * upstream).sum().backward()
 
-    got_raw = raw.float().requires_grad_()
-    got = cpu.cross_bilateral(single(guides), got_raw, corners, window, threads=2, isa=isa)
-    (got * upstream.float()).sum().backward()
+    got_raw = leaf(backend, raw)
+    if backend == "gpu":
+        got = gpu.cross_bilateral(single(guides, DEVICE), got_raw, corners, window, tile=TILE)
+    else:
+        got = cpu.cross_bilateral(single(guides), got_raw, corners, window, threads=2, isa=backend)
+    (got * upstream.float().to(got.device)).sum().backward()
     assert_close("g", got, expected, "cross-bilateral extreme" if case == "extreme" else "cross-bilateral")
     if case == "saturated":
         parts = [raw.grad.tensor_split([guides.betas], 1) for raw in (got_raw, expected_raw)]
@@ -124,79 +148,84 @@ def test_the_compiled_kernel_has_the_tables_terms() -> None:
     assert _cpu.terms() == [term.name for term in TERMS]
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
+@sides((7,), interpreted=(3,))
 @pytest.mark.parametrize("combination", ["eq10", "eq3"])
 @every_set
-def test_cpu_matches_reference(terms: Terms, combination: str, isa: str) -> None:
+def test_matches_reference(terms: Terms, combination: str, backend: str, side: int) -> None:
     guides = make_guides(23, 37, terms)
-    corners = torch.tensor([[0, 0], [-5, 10], [12, 20]])
-    raw = make_raw(guides, combination, (3, 13, 19))
-    compare(guides, raw, corners, Window(7, combination=combination), isa)
+    corners = patches(backend, (0, 0), (-5, 10), (12, 20))
+    raw = make_raw(guides, combination, (len(corners), 13, 19))
+    compare(guides, raw, corners, Window(side, combination=combination), backend)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
+@sides((9,), interpreted=(5,))
 @pytest.mark.parametrize("every", [2, 3, 4, 5])
-def test_cpu_matches_reference_on_a_lattice(every: int, isa: str) -> None:
+def test_matches_reference_on_a_lattice(every: int, backend: str, side: int) -> None:
     guides = make_guides(20, 19)
-    raw = make_raw(guides, "eq10", (2, 17, 18))
-    compare(guides, raw, torch.tensor([[-2, 1], [3, 0]]), Window(9, every), isa)
+    corners = patches(backend, (3, 0), (-2, 1))
+    raw = make_raw(guides, "eq10", (len(corners), 16, 18))
+    compare(guides, raw, corners, Window(side, every), backend)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
-@pytest.mark.parametrize("side", [1, 3, 19, 31])
+@sides((1, 3, 19, 31), interpreted=(3,))
 @pytest.mark.parametrize("size", [(1, 1), (1, 17), (16, 1), (5, 7), (33, 15)])
-def test_cpu_at_awkward_sizes(size: tuple[int, int], side: int, isa: str) -> None:
+def test_at_awkward_sizes(size: tuple[int, int], backend: str, side: int) -> None:
     """Images smaller than the window, one pixel, one more and less than a vector."""
     guides = make_guides(*size)
-    compare(guides, make_raw(guides, "eq10", (1, *size)), ORIGIN, Window(side), isa)
+    compare(guides, make_raw(guides, "eq10", (1, *size)), ORIGIN, Window(side), backend)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
-def test_cpu_takes_any_strides(isa: str) -> None:
+@sides((5,), interpreted=(1,))
+def test_any_strides(backend: str, side: int) -> None:
     guides = make_guides(20, 20)
     raw = make_raw(guides, "eq10", (2, 18, 20))
     corners = torch.tensor([[0, 0], [1, -1]])
-    compare(guides, raw.contiguous(memory_format=torch.channels_last), corners, Window(5), isa)
-    compare(guides, raw.transpose(2, 3).contiguous().transpose(2, 3), corners, Window(5), isa)
+    compare(guides, raw.contiguous(memory_format=torch.channels_last), corners, Window(side), backend)
+    compare(guides, raw.transpose(2, 3).contiguous().transpose(2, 3), corners, Window(side), backend)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
+@sides((9,), interpreted=(3,))
 @pytest.mark.parametrize("scale", [10.0, 100.0])
-def test_cpu_with_saturated_heads(scale: float, isa: str) -> None:
+def test_saturated_heads(scale: float, backend: str, side: int) -> None:
     """β = ±1, bandwidths of 0 and of hundreds.
 
     Where every pixel of a scale's head is saturated, its gradient is only what rounding leaves of 1 − β²: as in torch.
     So the scales are measured by the largest gradient of all of them.
     """
-    guides = make_guides(20, 20)
-    compare(guides, make_raw(guides, "eq10", (1, 20, 20), scale), ORIGIN, Window(9), isa, "saturated")
+    guides = make_guides(16, 20)
+    compare(guides, make_raw(guides, "eq10", (1, 16, 20), scale), ORIGIN, Window(side), backend, "saturated")
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
-def test_cpu_with_extreme_radiance(isa: str) -> None:
+@sides((9,), interpreted=(3,))
+def test_extreme_radiance(backend: str, side: int) -> None:
     """A firefly as bright as guides can be: right in what sees it, and as right as ever in what does not."""
-    guides = make_guides(20, 20)
+    guides = make_guides(16, 20)
     guides.planes[0, 25, 25] = LARGEST
-    raw = make_raw(guides, "eq10", (1, 20, 20))
-    compare(guides, raw, ORIGIN, Window(9), isa, "extreme")
+    raw = make_raw(guides, "eq10", (1, 16, 20))
+    compare(guides, raw, ORIGIN, Window(side), backend, "extreme")
     far = torch.tensor([[10, 10]])
-    compare(guides, raw[:, :, 10:, 10:], far, Window(9), isa)
+    compare(guides, raw[:, :, 10:, 10:], far, Window(side), backend)
 
 
-@pytest.mark.parametrize("isa", VARIANTS)
+@sides((5,), interpreted=(3,))
 @pytest.mark.parametrize("terms", [EVERY_SET[0], EVERY_SET[-1]], ids=names)
-def test_fused_loss_matches_reference(terms: Terms, isa: str) -> None:
+def test_fused_loss_matches_reference(terms: Terms, backend: str, side: int) -> None:
     guides = make_guides(21, 33, terms)
     other = make_guides(21, 33, terms, seed=5)
     weight = 1 / (other.denoised.mean(0) ** 2 + 0.01)
-    corners = torch.tensor([[0, 0], [-4, 18]])
-    raw = make_raw(guides, "eq10", (2, 17, 21))
+    corners = patches(backend, (0, 0), (-4, 18))
+    raw, window = make_raw(guides, "eq10", (len(corners), 15, 21)), Window(side)
     expected_raw = raw.clone().requires_grad_()
-    expected = reference.cross_bilateral_loss(guides, expected_raw, corners, other.radiance, weight, Window(5))
+    expected = reference.cross_bilateral_loss(guides, expected_raw, corners, other.radiance, weight, window)
     (3 * expected).backward()
-    got_raw = raw.float().requires_grad_()
-    target, weight = other.radiance.float(), weight.float()
-    got = cpu.cross_bilateral_loss(single(guides), got_raw, corners, target, weight, Window(5), threads=2, isa=isa)
+    got_raw = leaf(backend, raw)
+    target, weight = (values.float().to(got_raw.device) for values in (other.radiance, weight))
+    if backend == "gpu":
+        half = single(guides, DEVICE)
+        got = gpu.cross_bilateral_loss(half, got_raw, corners, target, weight, window, tile=TILE)
+    else:
+        half = single(guides)
+        got = cpu.cross_bilateral_loss(half, got_raw, corners, target, weight, window, threads=2, isa=backend)
     (3 * got).backward()
     assert_close("loss", got, expected, "cross-bilateral")
     assert_heads_close(got_raw.grad, expected_raw.grad, "cross-bilateral gradients")
@@ -214,15 +243,40 @@ def test_reference_loss_is_the_weighted_mean_square() -> None:
     torch.testing.assert_close(got, (0.5 * weight[at] * (g - other.radiance[:, *at]) ** 2).mean())
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_stacked_crops_are_as_if_alone(backend: str) -> None:
+    """The second of two crops below one another gives what it gives on its own, bit for bit."""
+    crops = [single(make_guides(9, 11, seed=seed, margin=3), DEVICE) for seed in (0, 1)]
+    raw = make_raw(crops[0], "eq10", (1, 4, 8)).float().to(DEVICE)
+    corners = torch.tensor([[1, 2]])
+    alone = cross_bilateral(crops[1], raw, corners, Window(3), backend=None if DEVICE == "cuda" else backend)
+    stacked = Guides.stack(crops)
+    below = corners + torch.tensor([[stacked.pitch, 0]])
+    got = cross_bilateral(stacked, raw, below, Window(3), backend=None if DEVICE == "cuda" else backend)
+    assert torch.equal(got, alone)
+
+
+def test_gpu_tiles_do_not_change_a_bit() -> None:
+    """A pixel's value and gradient do not depend on the program that it falls to."""
+    guides = single(make_guides(3, 33, ALWAYS), DEVICE)
+    results = []
+    for tile in ((4, 64), gpu.TILE):
+        raw = leaf("gpu", make_raw(guides, "eq10", (1, 3, 33)))
+        g = gpu.cross_bilateral(guides, raw, torch.tensor([[0, -1]]), Window(3), tile=tile)
+        g.square().sum().backward()
+        results.append((g.detach(), raw.grad))
+    assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("backend", [b for b in BACKENDS if b != "gpu" or INTERPRETED])
 def test_every_backend_gives_the_same(backend: str) -> None:
     """Through the function that callers use: what it chooses by itself is the compiled form."""
-    guides = single(make_guides(12, 14))
-    raw = make_raw(guides, "eq10", (1, 12, 14)).float()
+    guides = single(make_guides(4, 14))
+    raw = make_raw(guides, "eq10", (1, 4, 14)).float()
     arguments = (guides, raw, ORIGIN)
     loss = (*arguments, guides.denoised, guides.planes[3].abs())
     for function, given in ((cross_bilateral, arguments), (cross_bilateral_loss, loss)):
-        chosen, got = function(*given, Window(5)), function(*given, Window(5), backend=backend)
+        chosen, got = function(*given, Window(3)), function(*given, Window(3), backend=backend)
         torch.testing.assert_close(got, chosen, rtol=1e-5, atol=1e-5)
         assert backend != "cpu" or torch.equal(got, chosen)
 

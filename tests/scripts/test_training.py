@@ -277,7 +277,7 @@ def test_rendered_views_go_all_the_way(tmp_path: Path) -> None:
     few = ("--views", 1, "--validation", 1, "--size", 32, "--reference-spp", 4, "--workers", 1)
     (tmp_path / "no scenes").mkdir()
     rendering = command("render_dataset", tmp_path / "no scenes", "-o", data, *few)
-    subprocess.run(rendering, check=True, stdout=subprocess.DEVNULL, timeout=300)
+    subprocess.run(rendering, check=True, stdout=subprocess.DEVNULL, timeout=900)  # compiled for every room
     ran(*training("deep-combiner", data, tmp_path / "run", "--steps", 2))
     said = ran("evaluate", "quality", "--data", data, "--out", tmp_path / "table.csv", "--methods", "noisy", "oidn")
     assert "| oidn | 1 |" in said

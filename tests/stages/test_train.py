@@ -23,7 +23,7 @@ def test_adam_is_that_of_torch(limit: float) -> None:
         rate = 0.01 * (1 + math.cos(step))
         for parameters in (ours, theirs):
             sum(((p - 1) ** 2).sum() * (1 + step % 3) for p in parameters).backward()
-        adam.step(rate)
+        adam.step(rate, torch.tensor(1.0))
         torch.nn.utils.clip_grad_norm_(theirs, limit)
         reference.param_groups[0]["lr"] = rate
         reference.step()
@@ -36,10 +36,12 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
     parameter = torch.ones(3, requires_grad=True)
     adam = Adam([parameter], 1e-7, 1.0)
     parameter.grad = torch.tensor([1.0, float("nan"), 0.0])
-    adam.step(0.1)
+    adam.step(0.1, torch.tensor(1.0))
+    parameter.grad = torch.tensor([1.0, 0.0, 0.0])
+    adam.step(0.1, torch.tensor(float("inf")))
     assert torch.equal(parameter.detach(), torch.ones(3))
     parameter.grad = torch.tensor([1.0, 0.0, 0.0])
-    adam.step(0.1)
+    adam.step(0.1, torch.tensor(1.0))
     assert parameter[0] < 1
     assert parameter.grad is None
 

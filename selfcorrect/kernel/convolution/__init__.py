@@ -1,15 +1,21 @@
 """The network's 3×3 convolutions, one after the other: validated here, computed by one of the forms beside."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError
 from selfcorrect.kernel.backend import choose
-from selfcorrect.kernel.convolution import cpu, reference
+from selfcorrect.kernel.convolution import cpu, gpu, reference
 from selfcorrect.kernel.convolution.cpu import LARGEST_WIDTH, best_instruction_set
 
-__all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions"]
+__all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "has_fast_bf16"]
+
+
+def has_fast_bf16(device: torch.device) -> bool:
+    """Whether torch's own convolutions in bfloat16 are fast there; else they are emulated."""
+    return gpu.has_fast_bf16(device) or (device.type == "cpu" and best_instruction_set("bf16") == "amx")
 
 
 def convolutions(
@@ -31,7 +37,7 @@ def convolutions(
         region: top, left, bottom, right of the pixels whose heads are wanted; by default all. The compiled form gives
             no gradients of a part.
         precision: "fp32", or "bf16": weights, activations and upstream gradients are rounded to bfloat16, sums are
-            in float32. Processors without matrix tiles (AMX) compute in float32 then, too.
+            in float32. Processors without matrix tiles (AMX), and cards without them, compute in float32 then, too.
         threads: of the compiled form; no influence on the result.
         backend: as for :func:`selfcorrect.kernel.backend.choose`; layers of more than 16 channels are the reference's.
 
@@ -54,6 +60,7 @@ def convolutions(
         [*images, *parameters],
         fits=max(inputs, *(bias.shape[0] for bias in parameters[1::2])) <= LARGEST_WIDTH,
         limit=f"layers of at most {LARGEST_WIDTH} channels",
+        gpu=True,
     )
-    convolve = cpu.convolutions if form == "cpu" else reference.convolutions
+    convolve: Callable[..., Tensor] = {"cpu": cpu, "gpu": gpu, "reference": reference}[form].convolutions
     return convolve(images, parameters, log_radiance=log_radiance, region=region, precision=precision, threads=threads)

@@ -1,15 +1,17 @@
 """The cross-bilateral kernel (Back et al. 2022, Eqs. 3, 8, 10 and 11): validated here, computed by one of its forms.
 
-``reference.py`` is the mathematics, ``cpu.py`` the compiled form. One for another device is a file beside them with the
-functions of :class:`Form`, and a line in :func:`_form`.
+``reference.py`` is the mathematics, ``cpu.py`` the compiled form, ``gpu.py`` the one for CUDA: it needs Triton, and is
+imported when it is asked for. One for another device is a file beside them with the functions of :class:`Form`, and a
+line in :func:`_form`; until then ROCm and others run the reference, shift by shift.
 """
 
-from typing import Protocol
+from importlib import import_module
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor
 
-from selfcorrect.errors import FrameError
+from selfcorrect.errors import FrameError, MissingPackageError
 from selfcorrect.kernel.backend import choose
 from selfcorrect.kernel.cross_bilateral import cpu, reference
 from selfcorrect.kernel.cross_bilateral.window import LARGEST_WINDOW, Window
@@ -41,8 +43,20 @@ class Form(Protocol):
 
 
 def _form(guides: Guides, backend: str | None) -> Form:
+    name = choose(backend, [guides.planes], gpu=True)
+    if name == "gpu":
+        return _gpu()
     forms: dict[str, Form] = {"cpu": cpu, "reference": reference}
-    return forms[choose(backend, [guides.planes])]
+    return forms[name]
+
+
+def _gpu() -> Form:
+    try:
+        return cast(Form, import_module("selfcorrect.kernel.cross_bilateral.gpu"))
+    except ModuleNotFoundError as error:
+        if error.name != "triton":
+            raise
+        raise MissingPackageError("the kernel for CUDA", "gpu") from None
 
 
 def heads_count(guides: Guides, combination: str) -> int:
@@ -64,7 +78,7 @@ def cross_bilateral(
     Args:
         guides: padded buffers of one half, linear radiance.
         raw: network outputs before tanh and softplus, (N, heads, h, w), any strides.
-        corners: image row and column of each patch's first pixel, (N, 2), int64; may lie outside the image.
+        corners: image row and column of each patch's first pixel, (N, 2), int64, on the CPU; may lie outside the image.
         window: taps and combination.
         threads: of the compiled form.
         backend: as for :func:`selfcorrect.kernel.backend.choose`.
@@ -75,6 +89,7 @@ def cross_bilateral(
     Raises:
         FrameError: shapes or types do not fit, or a patch reaches beyond the guides' margin.
         SettingsError: no such backend for these tensors.
+        MissingPackageError: tensors on CUDA, without Triton.
     """
     _validate(guides, raw, corners, window)
     return _form(guides, backend).cross_bilateral(guides, raw, corners, window, threads=threads)
@@ -105,9 +120,10 @@ def _validate(guides: Guides, raw: Tensor, corners: Tensor, window: Window) -> N
     heads = heads_count(guides, window.combination)
     if raw.ndim != 4 or raw.shape[1] != heads:
         raise FrameError(f"expected raw heads of shape (N, {heads}, h, w), but got {tuple(raw.shape)}")
-    if corners.shape != (raw.shape[0], 2) or corners.dtype != torch.int64:
+    if corners.shape != (raw.shape[0], 2) or corners.dtype != torch.int64 or corners.device.type != "cpu":
         raise FrameError(
-            f"expected int64 corners of shape ({raw.shape[0]}, 2), but got {corners.dtype} of {tuple(corners.shape)}"
+            f"expected int64 corners of shape ({raw.shape[0]}, 2) on the CPU, "
+            f"but got {corners.dtype} of {tuple(corners.shape)} on {corners.device.type}"
         )
     if raw.dtype != guides.planes.dtype:
         raise FrameError(f"expected raw heads in {guides.planes.dtype}, but got {raw.dtype}")

@@ -1,4 +1,7 @@
-"""Non-local means with variance cancellation (Rousselle et al. 2012): validated here, computed by one form beside."""
+"""Non-local means with variance cancellation (Rousselle et al. 2012): validated here, computed by one form beside.
+
+There is no form for another device: what lies there comes to the CPU, and the means go back.
+"""
 
 from collections.abc import Iterator
 
@@ -36,9 +39,13 @@ def non_local_means(
     _validate(guide, variance, radius, patch_radius, k)
     if values.shape[:2] != guide.shape[:2] or not 1 <= values.shape[2] <= 4:
         raise FrameError(f"expected values of shape {tuple(guide.shape[:2])} + (1 … 4,), but got {tuple(values.shape)}")
+    there = values.device
+    if backend is None:
+        values, guide, variance = values.cpu(), guide.cpu(), variance.cpu()
     if choose(backend, [values, guide, variance], dtypes=_DTYPES) == "reference":
         return reference.non_local_means(values, guide, variance, radius=radius, patch_radius=patch_radius, k=k)
-    return cpu.non_local_means(values, guide, variance, radius=radius, patch_radius=patch_radius, k=k, threads=threads)
+    means = cpu.non_local_means(values, guide, variance, radius=radius, patch_radius=patch_radius, k=k, threads=threads)
+    return means.to(there)
 
 
 def strips(
@@ -63,7 +70,7 @@ def strips(
         SettingsError: a number is out of range.
     """
     _validate(guide, variance, radius, patch_radius, k)
-    return cpu.strips(guide, variance, radius=radius, patch_radius=patch_radius, k=k, threads=threads)
+    return cpu.strips(guide.cpu(), variance.cpu(), radius=radius, patch_radius=patch_radius, k=k, threads=threads)
 
 
 def _validate(guide: Tensor, variance: Tensor, radius: int, patch_radius: int, k: float) -> None:

@@ -3,6 +3,8 @@
 The compiled form's cost is that of its centres: a model for every pixel is 114 sums over 2,601 pixels at the paper's
 window. Every pixel takes the mean of all models around it, so that models at every second or fourth pixel of every
 second or fourth row (``stride``) say nearly the same for a fourth or a sixteenth of the time.
+
+There is no form for another device: what lies there comes to the CPU, and the fit goes back.
 """
 
 import math
@@ -64,11 +66,15 @@ def regress(
             f"but got {stride}, {ridge}, {bandwidth}"
         )
     _check_shapes(features, targets)
+    there = targets.device
+    if backend is None:
+        features, targets = [feature.cpu() for feature in features], targets.cpu()
     if choose(backend, [*features, targets], dtypes=_DTYPES) == "reference":
         return reference.regress(features, targets, window=window, ridge=ridge, bandwidth=bandwidth, stride=stride)
-    return cpu.regress(
+    fitted = cpu.regress(
         features, targets, window=window, ridge=ridge, bandwidth=bandwidth, stride=stride, threads=threads
     )
+    return fitted.to(there)
 
 
 def regress_non_local(
@@ -90,7 +96,9 @@ def regress_non_local(
         ridge, threads: as for :func:`regress`.
     """
     _check_shapes(features, targets)
-    return cpu.regress_non_local(features, targets, weights, radius=radius, ridge=ridge, threads=threads)
+    features, there = [feature.cpu() for feature in features], targets.device
+    fitted = cpu.regress_non_local(features, targets.cpu(), weights, radius=radius, ridge=ridge, threads=threads)
+    return fitted.to(there)
 
 
 def _check_shapes(features: list[Tensor], targets: Tensor) -> None:

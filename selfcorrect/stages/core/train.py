@@ -22,6 +22,7 @@ Progress = Callable[[int, int, float], None]
 _WARM_UP = 20  # steps over which the cosine schedule reaches its rate, but no more than a fifth of all
 _SHORTEST_ROUND = 0.5  # of the time that the steps took before: less is not worth beginning again for
 _LEAST_GAIN = 0.001  # of Eq. 8, most of which is noise that no network can take away
+_FETCHED_EVERY = 16  # steps; also how far a time budget or Ctrl-C may be overrun while the device catches up
 _SAMPLE = 4  # rows and columns of patches that tell how well a network starts
 
 
@@ -41,25 +42,31 @@ class Adam:
         self._epsilon, self._limit = epsilon, limit
         self._first = torch.zeros(sum(p.numel() for p in self._parameters), device=self._parameters[0].device)
         self._second = torch.zeros_like(self._first)
-        self._steps = 0
+        # 0.9 and 0.999 to the power of the steps so far, which the host cannot count: it does not know which were taken
+        self._decay = torch.ones(2, dtype=torch.float64, device=self._first.device)
+        self._each = torch.tensor([0.9, 0.999], dtype=torch.float64).to(self._first.device)
 
     @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """One step down the gradients, which are taken away; none where they are not finite."""
+    def step(self, rate: float, loss: Tensor) -> None:
+        """One step down the gradients, which are taken away; none where they or the loss are not finite.
+
+        Nothing here makes the host wait for the device.
+        """
         gradient = torch.cat(
             [torch.zeros_like(p).flatten() if p.grad is None else p.grad.flatten() for p in self._parameters]
         )
         for parameter in self._parameters:
             parameter.grad = None
-        norm = float(gradient.norm())
-        if not math.isfinite(norm):
-            return
-        gradient *= min(1.0, self._limit / (norm + 1e-6))
-        self._steps += 1
-        self._first.lerp_(gradient, 0.1)
-        self._second.mul_(0.999).addcmul_(gradient, gradient, value=0.001)
-        root = (self._second / (1 - 0.999**self._steps)).sqrt_().add_(self._epsilon)
-        change = (self._first / root).mul_(rate / (1 - 0.9**self._steps))
+        norm = gradient.norm().double()
+        taken = norm.isfinite() & loss.isfinite()
+        gradient *= (self._limit / (norm + 1e-6)).clamp(max=1.0)
+        decay = self._decay * self._each
+        first = self._first.lerp(gradient, 0.1)
+        second = (self._second * 0.999).addcmul_(gradient, gradient, value=0.001)
+        root = (second / (1 - decay[1])).sqrt_().add_(self._epsilon)
+        change = (first / root).mul_(rate / (1 - decay[0])).where(taken, 0.0)
+        for kept, new in ((self._first, first), (self._second, second), (self._decay, decay)):
+            kept.copy_(new.where(taken, kept))
         sizes = [p.numel() for p in self._parameters]
         for parameter, part in zip(self._parameters, change.split(sizes), strict=True):
             parameter.sub_(part.view_as(parameter))
@@ -110,6 +117,42 @@ def train(
     return losses
 
 
+class _Losses:
+    """Eq. 8 before each step, left on the device and fetched every so many steps: to fetch is to wait for it.
+
+    Args:
+        progress: told of each step in turn, when its loss is fetched.
+        device: that of the losses; on the CPU they are there at once.
+    """
+
+    def __init__(self, progress: Progress | None, device: torch.device):
+        self._progress = progress
+        self._every = 1 if device.type == "cpu" else _FETCHED_EVERY
+        self._values: list[float] = []
+        self._waiting: list[Tensor] = []
+
+    @property
+    def count(self) -> int:
+        """Of the steps so far."""
+        return len(self._values) + len(self._waiting)
+
+    def add(self, loss: Tensor, steps: int) -> None:
+        """The loss of the next out of so many steps."""
+        self._waiting.append(loss)
+        if len(self._waiting) == self._every:
+            self.fetched(steps)
+
+    def fetched(self, steps: int) -> list[float]:
+        """All of them, on the host."""
+        if self._waiting:
+            for value in torch.stack(self._waiting).tolist():
+                self._values.append(value)
+                if self._progress is not None:
+                    self._progress(len(self._values), steps, value)
+            self._waiting.clear()
+        return self._values
+
+
 def _round(
     network: Network,
     guides: tuple[Guides, Guides],
@@ -125,21 +168,18 @@ def _round(
     optimiser = Adam(network.parameters(), settings.adam_epsilon, settings.gradient_limit or math.inf)
     rate = learning_rate(guides, settings)
     steps = steps_count((guides[0].height, guides[0].width), settings)
-    losses: list[float] = []
+    losses = _Losses(progress, guides[0].planes.device)
     began = time.perf_counter()
     for corners in batches(guides[0], settings, generator):
-        done = max(len(losses) / steps, (time.perf_counter() - began) / max(end - began, 1e-9)) if steps else 1.0
+        done = max(losses.count / steps, (time.perf_counter() - began) / max(end - began, 1e-9)) if steps else 1.0
         if done >= 1 or stop():
             break
         batch = [patch for half in guides for patch in half.views(corners, size)]
         loss = dual_buffer_loss(network(batch), corners, guides, weights, settings)
         loss.backward()
-        if bool(loss.isfinite()):
-            optimiser.step(rate * _schedule(len(losses), steps, done, settings))
-        losses.append(float(loss.detach()))
-        if progress is not None:
-            progress(len(losses), steps, losses[-1])
-    return losses
+        optimiser.step(rate * _schedule(losses.count, steps, done, settings), loss.detach())
+        losses.add(loss.detach(), steps)
+    return losses.fetched(steps)
 
 
 @torch.no_grad()

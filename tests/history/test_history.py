@@ -1,0 +1,100 @@
+"""A frame's halves with the samples of its neighbours: what helps, what is left alone, what is refused."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import denoisers
+from selfcorrect import Frame
+from selfcorrect.errors import FrameError
+from selfcorrect.history import with_history
+from selfcorrect.history.motion import fetched
+
+SIZE, STEP = (64, 96), 3  # pixels that the picture moves to the left from frame to frame
+
+
+def texture() -> Tensor:
+    """A wide picture of smooth blobs of all sizes, (64, 160, 3) in 0.2 … 1."""
+    generator = torch.Generator().manual_seed(0)
+    total = torch.zeros(1, 3, SIZE[0], 160)
+    for cells in (4, 8, 16):
+        noise = torch.rand(1, 3, cells, 2 * cells, generator=generator)
+        total += torch.nn.functional.interpolate(noise, size=(SIZE[0], 160), mode="bicubic")
+    image = total[0].permute(1, 2, 0)
+    return 0.2 + 0.8 * (image - image.min()) / (image.max() - image.min())
+
+
+def frame(number: int, *, light: float = 1.0, seed: int | None = None) -> tuple[Frame, Tensor]:
+    """A frame of a camera that pans over the picture, and its true radiance."""
+    albedo = texture()[:, 30 + STEP * number :][:, : SIZE[1]].contiguous()
+    truth = light * albedo
+    generator = torch.Generator().manual_seed(number if seed is None else seed)
+    halves = tuple(truth * (1 + 0.5 * torch.randn(*SIZE, 3, generator=generator)) for _ in "ab")
+    return Frame(color=halves, albedo=(albedo, albedo.clone())).denoise(denoisers.create("box")), truth
+
+
+def error(image: Tensor, truth: Tensor) -> float:
+    return float(((image - truth) ** 2).mean())
+
+
+def identity(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
+    return color
+
+
+def test_neighbours_bring_their_samples_along_the_motion() -> None:
+    here, truth = frame(2)
+    neighbours = {distance: frame(2 + distance)[0] for distance in (-2, -1, 1, 2)}
+    gathered, history = with_history(here, neighbours, identity)
+    (candidate,) = gathered.more
+    assert candidate.name == "history"
+    assert history.neighbours == (-2, -1, 1, 2)
+    assert all(share > 0.8 for share in history.found.values())
+    assert 3 < history.samples <= 5
+    noisy = (here.color[0] + here.color[1]) / 2
+    assert error(candidate.full, truth) < 0.45 * error(noisy.clamp(min=0), truth)
+
+
+def test_half_a_knows_nothing_of_half_b() -> None:
+    """Not a bit: only the motion is found in both together, and it is the same here."""
+    here, other = frame(2)[0], frame(3)[0]
+    changed = Frame(color=(other.color[0], other.color[1] * 1.5), albedo=other.albedo).with_denoised(
+        other.denoised, other.denoised_full
+    )
+    first, second = (with_history(here, {1: f}, identity)[0].more[0].halves for f in (other, changed))
+    assert torch.equal(first[0], second[0])
+    assert not torch.equal(first[1], second[1])
+
+
+def test_what_does_not_fit_is_left_alone() -> None:
+    """A light that goes out, and a cut: hardly anything of the neighbour is taken."""
+    here, truth = frame(2)
+    dark = frame(3, light=0.02)[0]
+    turned = {name: tuple(image.flip(0).flip(1) for image in getattr(here, name)) for name in ("color", "albedo")}
+    cut = Frame(**turned).denoise(denoisers.create("box"))
+    for neighbour in (dark, cut):
+        gathered, history = with_history(here, {1: neighbour}, identity)
+        assert history.samples < 1.25
+        own = (here.color[0] + here.color[1]).clamp(min=0) / 2
+        assert error(gathered.more[0].full, truth) < 1.1 * error(own, truth)
+
+
+def test_what_is_no_neighbour_is_refused() -> None:
+    here = frame(2)[0]
+    with pytest.raises(FrameError, match="with noise of its own"):
+        with_history(here, {1: here}, identity)
+    small = Frame(color=tuple(torch.rand(5, 6, 3) for _ in "ab")).denoise(denoisers.create("box"))
+    with pytest.raises(FrameError, match=r"of size \(64, 96\) at \+1, but got \(5, 6\)"):
+        with_history(here, {1: small}, identity)
+    same, history = with_history(here, {}, identity)
+    assert same is here
+    assert history.samples == 1
+
+
+def test_pixels_are_fetched_and_not_mixed() -> None:
+    image = torch.arange(12.0).reshape(3, 4, 1)
+    offset = torch.tensor([1.4, -0.6]).expand(3, 4, 2)
+    got, inside = fetched(image, offset)
+    assert np.array_equal(got[1, :, 0], [1, 2, 3, 3])
+    assert inside[1].tolist() == [True, True, True, False]
+    assert not inside[0].any()

@@ -1,0 +1,90 @@
+"""The facts of a run: what each reader is told is what is known, under the names that files and scripts rely on."""
+
+import json
+from dataclasses import asdict, replace
+from importlib.metadata import version
+
+from selfcorrect import Settings, facts
+from selfcorrect.guard import Estimate
+from selfcorrect.image.repair import Repairs
+from selfcorrect.stages.stage import Start
+
+ESTIMATE = Estimate(noisy=0.5, denoised=0.02, corrected=0.015, change=-0.25, standard_error=0.03, improved=True)
+DENOISED = facts.Denoised(
+    denoiser="box",
+    channels={"color": ["R", "G", "B"], "depth": ["dd.T"]},
+    size=(24, 30),
+    repairs={"color": Repairs(3, 1), "depth": Repairs(0, 0)},
+    constant=["albedo"],
+    seconds={"read": 0.12345, "denoise": 0.5},
+)
+CORRECTED = facts.Corrected(
+    before=DENOISED,
+    preset="fast",
+    settings=Settings(seed=7),
+    estimate=ESTIMATE,
+    start=Start(warm=True, cold_loss=0.5, warm_loss=0.25),
+    seconds={"train": 1.0, "infer": 0.25},
+    input_scale=2.0,
+    steps=17,
+    parameters=20303,
+    threads=2,
+    more={"frame": 3},
+)
+WRITTEN = facts.Written("out.exr", 4, {"write": 0.01, "total": 2.0}, CORRECTED)
+RUN = {
+    "preset": "fast",
+    "denoiser": "box",
+    "version": version("selfcorrect"),
+    "estimate": asdict(ESTIMATE),
+    "start": {"warm": True, "cold_loss": 0.5, "warm_loss": 0.25},
+    "frame": 3,
+}
+
+
+def test_attributes() -> None:
+    attributes = CORRECTED.attributes()
+    assert set(attributes) == {"selfcorrect/settings", "selfcorrect/run"}
+    assert json.loads(attributes["selfcorrect/settings"]) == Settings(seed=7).to_dict()
+    assert list(json.loads(attributes["selfcorrect/run"]).items()) == list(RUN.items())
+
+
+def test_json() -> None:
+    told = json.loads(json.dumps(WRITTEN.to_dict()))
+    assert list(told.items()) == [
+        ("output", "out.exr"),
+        ("settings", Settings(seed=7).to_dict()),
+        *RUN.items(),
+        ("channels", {"color": ["R", "G", "B"], "depth": ["dd.T"]}),
+        ("seconds", {"read": 0.123, "denoise": 0.5, "train": 1.0, "infer": 0.25, "write": 0.01, "total": 2.0}),
+        ("size", {"width": 30, "height": 24}),
+        ("repairs", {"color": {"non_finite": 3, "negative": 1}, "depth": {"non_finite": 0, "negative": 0}}),
+        ("constant", ["albedo"]),
+        ("input_scale", 2.0),
+        ("steps", 17),
+        ("parameters", 20303),
+        ("threads", 2),
+    ]
+
+
+def test_log() -> None:
+    assert facts.channel_lines(DENOISED.channels) == ["color: R, G, B", "depth: dd.T"]
+    assert DENOISED.lines() == [
+        "albedo: the same at every pixel; not used",
+        "color: 3 pixels were NaN or infinite, 1 negative; repaired",
+    ]
+    assert WRITTEN.lines() == [
+        "relMSE ≈ 0.02 → 0.015 (-25 ± 3 %)",
+        "out.exr: 4 values beyond the range of half floats were clipped",
+        "out.exr: written after 2.0 s (train 1.0 s, infer 0.2 s)",
+    ]
+    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None))
+    assert unguarded.lines() == WRITTEN.lines()[2:]
+    assert unguarded.to_dict()["estimate"] is None
+
+
+def test_what_a_frame_started_from() -> None:
+    assert CORRECTED.start_line() == "started warm (loss before training 0.25 warm, 0.5 cold)"
+    cut = replace(CORRECTED, start=Start(False, 0.5, 0.75))
+    assert cut.start_line().startswith("did not look like the frame before: started cold (loss")
+    assert replace(CORRECTED, start=Start(False)).start_line() == "started cold"
