@@ -187,10 +187,13 @@ class Settings:
             guard=True,
             crossed_weights=True,
             precision="bf16",
+            candidates="auto",
         )
         return {
             "balanced": balanced,
-            "fast": replace(balanced, steps=50, warm_steps=17, learning_rate=5e-3, warm_learning_rate=2.5e-3),
+            "fast": replace(
+                balanced, steps=50, warm_steps=17, learning_rate=5e-3, warm_learning_rate=2.5e-3, candidates="none"
+            ),
             "best": replace(balanced, batch=16, visits=128, candidates="all"),
             "paper": cls(),
         }

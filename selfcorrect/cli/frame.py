@@ -8,7 +8,7 @@ from typing import Any
 from selfcorrect import exr, files
 from selfcorrect.cli import flags, memory, pages
 from selfcorrect.cli.runner import Runner
-from selfcorrect.cli.terminal import EndOnInterrupt, answer
+from selfcorrect.cli.terminal import EndOnInterrupt, answer, log
 from selfcorrect.facts import Written
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
@@ -61,6 +61,10 @@ def correct_files(
     if maxmem is not None:
         size, settings = memory.parse_size(maxmem), flags.settings_of(options)
         extra = sum(len(paths) for paths in flags.extra_files(options, settings).values())
+        if settings.candidates != "none" and not memory.fits(size, sources, settings, extra=extra):
+            options.candidates = "none"
+            settings = flags.settings_of(options)
+            log(f"no further candidates: --maxmem {maxmem} has no room for them")
         scratch = memory.scratch_within(size, sources, settings, extra=extra)
     runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
     remove_abandoned(exr.check_target(output).parent)

@@ -19,7 +19,7 @@ from selfcorrect.files import Sources
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.patches import crops
 
-__all__ = ["Needs", "needs", "parse_size", "scratch_within"]
+__all__ = ["Needs", "fits", "needs", "parse_size", "scratch_within"]
 
 GIB = 2**30
 _BASE = 0.35 * GIB  # the interpreter, torch, the OpenEXR library and OIDN's weights
@@ -67,7 +67,7 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
         SettingsError: the frame does not fit.
     """
     found = needs(sources, settings, extra=extra)
-    needed = dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
+    needed = _with_denoiser(found)
     stage = max(needed, key=lambda name: needed[name])
     if needed[stage] > limit:
         least = math.ceil(10 * needed[stage] / GIB) / 10
@@ -76,6 +76,15 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
             f"(most of it to {stage}), but got {limit / GIB:.1f}G"
         )
     return int(limit - found.denoise - _OIDN)
+
+
+def fits(limit: int, sources: Sources, settings: Settings, *, extra: int = 0) -> bool:
+    """Whether a frame can be corrected within so many bytes; arguments as for :func:`scratch_within`."""
+    return max(_with_denoiser(needs(sources, settings, extra=extra)).values()) <= limit
+
+
+def _with_denoiser(found: Needs) -> dict[str, float]:
+    return dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
 
 
 def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:

@@ -12,7 +12,7 @@ import pytest
 from helpers.commands import BALANCED, call
 
 from selfcorrect import Settings
-from selfcorrect.cli.memory import GIB, needs, parse_size, scratch_within
+from selfcorrect.cli.memory import GIB, fits, needs, parse_size, scratch_within
 from selfcorrect.errors import FileError, SettingsError
 from selfcorrect.exr import header as exrheader
 from selfcorrect.files import Sources
@@ -46,12 +46,13 @@ def write_half(path: Path, seed: int, size: tuple[int, int], dtype: type) -> str
 
 def sources(folder: Path, size: tuple[int, int] = (30, 40), dtype: type = np.float16) -> Sources:
     folder.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True)
     return Sources(*(write_half(folder / f"{half}.exr", seed, size, dtype) for seed, half in enumerate("ab")))
 
 
 def test_the_command_takes_no_more_than_is_told(tmp_path: Path) -> None:
     """The peak of the whole command; a denoiser that takes nothing beside its images."""
-    frame, settings = sources(tmp_path, SIZE), Settings.preset("balanced", patch=16, steps=1)
+    frame, settings = sources(tmp_path, SIZE), Settings.preset("balanced", patch=16, steps=1, candidates="none")
     (tmp_path / "same.py").write_text(
         "class Same:\n"
         "    name, features, reads_only = 'same', frozenset({'albedo', 'normal'}), True\n"
@@ -82,13 +83,25 @@ def eight_k(folder: Path, dtype: type) -> Sources:
 
 
 def test_eight_k_fits_in_six_gibibytes(tmp_path: Path) -> None:
-    """With what OIDN takes where nothing bounds it, 1.5 GiB; of floats, with what it can do with."""
-    settings = Settings.preset("balanced")
+    """With what OIDN takes where nothing bounds it, 1.5 GiB; of floats, with what it can do with.
+
+    Without further candidates: the command leaves them out where there is no room (the next test).
+    """
+    settings = Settings.preset("balanced", candidates="none")
     assert scratch_within(6 * GIB, eight_k(tmp_path, np.float16), settings) > 1.5 * GIB
     half = needs(Sources(str(tmp_path / "a.exr"), ""), settings)
     assert scratch_within(6 * GIB, eight_k(tmp_path, np.float32), settings) > 1.0 * GIB
     full = needs(Sources(str(tmp_path / "a.exr"), ""), settings)
     assert full.correct - half.correct == 7680 * 4320 * 2 * 12, "two G-buffers of both halves"
+
+
+def test_candidates_are_left_out_where_there_is_no_room(tmp_path: Path) -> None:
+    frame, small = eight_k(tmp_path, np.float16), sources(tmp_path / "small", dtype=np.float16)
+    settings = Settings.preset("balanced")
+    assert settings.candidates == "auto"
+    assert not fits(6 * GIB, frame, settings)
+    assert fits(12 * GIB, frame, settings)
+    assert fits(6 * GIB, small, settings)
 
 
 def test_a_frame_that_does_not_fit_is_refused(tmp_path: Path) -> None:
