@@ -5,7 +5,8 @@
 Prints one row for each frame and number of samples, mean over the seeds: relMSE of the noisy image, of the denoised
 full buffer and of the corrected image, their ratio with its standard error (bootstrap over 16x16 tiles of the first
 seed) and its range over the seeds, mean radiance over that of the noisy image, denoised and corrected, and what
-the guard, which knows no reference, estimates for the relMSE of denoised and corrected.
+the guard, which knows no reference, estimates for the relMSE of denoised and corrected. The preset's candidates are
+taken as the command takes them; seconds are of them and of the correction.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import torch
 
 import denoisers
 from selfcorrect import Frame, Settings, correct, exr, metrics
+from selfcorrect.candidates import with_candidates
 
 ROLES = ("color", "albedo", "normal", "visibility", "depth")
 
@@ -62,6 +64,13 @@ def row(options: argparse.Namespace, name: str, spp: int, denoiser: str, preset:
     frame = frame.denoise(denoisers.create(denoiser, threads=options.threads))
     noisy = (frame.color[0] + frame.color[1]) / 2
     start = time.perf_counter()
+    wanted = Settings.preset(preset).candidates
+    further = (
+        {}
+        if wanted == "none"
+        else {spec: denoisers.create(spec, threads=options.threads) for spec in denoisers.variants(denoiser)}
+    )
+    frame, _ = with_candidates(frame, further, every=wanted == "all")
     results = [correct(frame, Settings.preset(preset, seed=seed)) for seed in range(options.seeds)]
     images = [result.image for result in results]
     seconds = (time.perf_counter() - start) / options.seeds
