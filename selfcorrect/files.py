@@ -13,6 +13,7 @@ from torch import Tensor
 from selfcorrect import exr
 from selfcorrect.correct import Result
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
+from selfcorrect.exr.limits import check_alike
 from selfcorrect.frame import Frame, repaired
 from selfcorrect.settings import Settings
 
@@ -42,6 +43,12 @@ class Sources:
     denoised: str | None = None
     mapping: Mapping[str, str] | None = None
     sub_images: tuple[str, ...] = ()
+
+    @property
+    def paths(self) -> list[str]:
+        """Every file that is named, half a first."""
+        given = (self.a, self.b, self.denoised_a, self.denoised_b, self.denoised, *self.sub_images)
+        return [path for path in given if path]
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,7 @@ def load(sources: Sources) -> Loaded:
     """
     _check_distinct(sources)
     stamp = _stamp(sources.a)
+    check_alike(sources.paths)
     half_a, half_b = (_half(path, sources.mapping) for path in (sources.a, sources.b))
     height, width = half_a.buffers["color"].shape[:2]
     if half_b.buffers["color"].shape[:2] != (height, width):
@@ -189,6 +197,7 @@ def load_images(paths: Sequence[str]) -> Images:
         FrameError: sizes do not fit.
     """
     _check_different(paths)
+    check_alike(paths)
     first = exr.load_half(paths[0])
     size = first.buffers["color"].shape[:2]
     colors = [first.buffers["color"], *(_color_of(path, size) for path in paths[1:])]

@@ -15,7 +15,8 @@ from selfcorrect.cli import bench as cli_bench
 from selfcorrect.cli import memory
 from selfcorrect.cli import sequence as cli_sequence
 from selfcorrect.cli.runner import EndOnInterrupt, Runner, add_halves, add_run_flags, answer, log, mapping, settings_of
-from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError
+from selfcorrect.errors import FrameError, SelfcorrectError, SettingsError, out_of_memory, printable
+from selfcorrect.exr.file import one_line
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
 from selfcorrect.stages import uncorrelated
@@ -31,6 +32,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         failed: int | None = options.run(options)
     except SelfcorrectError as error:
         log(f"selfcorrect: error: {error}")
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not out_of_memory(error):
+            raise
+        log(f"selfcorrect: error: expected enough memory for this frame, but got: {one_line(error)}; see --maxmem")
         return 2
     except KeyboardInterrupt:
         log("selfcorrect: interrupted; what was not finished is not written")
@@ -138,7 +144,7 @@ def _inspect(options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(found.to_dict()))
     else:
-        print("\n".join(found.lines()))
+        print("\n".join(map(printable, found.lines())))
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -1,6 +1,7 @@
 """What the commands `frame`, `sequence` and `demo` do alike: flags, machine, one frame through memory, what is told."""
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -17,7 +18,7 @@ from tqdm import tqdm
 import denoisers
 from selfcorrect import files
 from selfcorrect.correct import Result, correct
-from selfcorrect.errors import SettingsError
+from selfcorrect.errors import SettingsError, printable
 from selfcorrect.exr.file import OUTPUT
 from selfcorrect.frame import Frame
 from selfcorrect.independence import doubts
@@ -40,10 +41,12 @@ __all__ = [
 _WRITE_SECONDS = 5e-7  # a pixel
 
 
-def log(line: str) -> None:
-    """One line on stderr."""
-    with OUTPUT:
-        print(line, file=sys.stderr, flush=True)
+def log(*lines: str) -> None:
+    """Lines on stderr, in one piece; what files put into them is escaped. Where nothing can be told, so be it."""
+    if sys.stderr is None:  # closed before Python began; print would take stdout
+        return
+    with OUTPUT, contextlib.suppress(OSError, ValueError):
+        print("\n".join(map(printable, lines)), file=sys.stderr, flush=True)
 
 
 def answer(report: Mapping[str, Any]) -> None:
@@ -266,7 +269,7 @@ class Runner:
         now = time.perf_counter()
         seconds = corrected.seconds | result.seconds | {"write": now - written, "total": now - corrected.began}
         lines.append(f"{output}: written after {seconds['total']:.1f} s ({_spent(result)})")
-        log("\n".join(lines))  # in one piece: another frame may be in work meanwhile
+        log(*lines)  # in one piece: another frame may be in work meanwhile
         return {
             "output": output,
             "settings": self.settings.to_dict(),
@@ -367,7 +370,8 @@ class EndOnInterrupt:
             raise KeyboardInterrupt
         self._asked = True
         # not log(): its lock may be held by the very thread that this interrupts
-        os.write(2, b"interrupted: writing what has been learned so far; again to write nothing\n")
+        with contextlib.suppress(OSError):
+            os.write(2, b"interrupted: writing what has been learned so far; again to write nothing\n")
 
 
 class _Progress:
@@ -387,7 +391,7 @@ class _Progress:
     def __call__(self, step: int, steps: int, loss: float) -> None:
         if self._meanwhile is not None:
             self._meanwhile()
-        if sys.stderr.isatty():
+        if sys.stderr is not None and sys.stderr.isatty():
             if self._bar is None:
                 self._bar = tqdm(total=steps, desc="training", unit="step", file=sys.stderr)
             self._bar.set_postfix(loss=f"{loss:.4g}")
