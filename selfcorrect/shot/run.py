@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from selfcorrect import exr, files
-from selfcorrect.errors import FileError, SelfcorrectError
+from selfcorrect.errors import FileError, SelfcorrectError, out_of_memory
 from selfcorrect.exr import channels
+from selfcorrect.exr.file import one_line
 from selfcorrect.publish import remove_abandoned
 from selfcorrect.settings import Settings
 from selfcorrect.shot.framerange import fill, has_frame
@@ -196,7 +197,7 @@ class _Run:
                 frame, fetched = ahead
                 try:
                     there = fetched.result()
-                except SelfcorrectError as error:
+                except Exception as error:
                     ahead = self._ahead(reader, frames)
                     self._fail(frame, error)
                     continue
@@ -254,7 +255,7 @@ class _Run:
             done = self.work(
                 Job(frame, output, fetched.loaded, fetched.recipe, network, lambda: self._flush(wait=False))
             )
-        except SelfcorrectError as error:
+        except Exception as error:
             self._fail(frame, error)
             return
         if not self.habits.cold:
@@ -274,10 +275,20 @@ class _Run:
         return self._network
 
     def _write(self, frame: int, made: str, done: Done) -> Any:
-        """In the writer's thread. The state comes first: there is no output whose successor could not go on from it."""
+        """In the writer's thread. The state comes first: there is no output whose successor could not go on from it.
+
+        But a state that cannot be written loses no image: the frame is written and then reported as failed.
+        """
+        problem = None
         if self.habits.save_state is not None and done.network is not None:
-            save_state(self._state_file(frame), State(done.network, frame, made), self.habits.settings)
-        return done.write()
+            try:
+                save_state(self._state_file(frame), State(done.network, frame, made), self.habits.settings)
+            except (OSError, SelfcorrectError) as error:
+                problem = error
+        report = done.write()
+        if problem is not None:
+            raise FileError(f"{problem}; the image {self.shot.target(frame)} is written")
+        return report
 
     def _state_file(self, frame: int) -> str:
         pattern = str(self.habits.save_state)
@@ -289,12 +300,20 @@ class _Run:
             frame, future = self._writing.popleft()
             try:
                 self._report(Outcome(frame, self.shot.target(frame), "written", report=future.result()))
-            except SelfcorrectError as error:
+            except Exception as error:
                 self._fail(frame, error)
 
-    def _fail(self, frame: int, error: SelfcorrectError) -> None:
+    def _fail(self, frame: int, error: Exception) -> None:
+        """Whatever one frame's files make fail ends this frame alone."""
         self._flush()
-        self._report(Outcome(frame, self.shot.target(frame), "failed", str(error)))
+        self._report(Outcome(frame, self.shot.target(frame), "failed", self._reason(frame, error)))
+
+    def _reason(self, frame: int, error: Exception) -> str:
+        if isinstance(error, SelfcorrectError):
+            return str(error)
+        sources = self.shot.sources(frame)
+        got = "too little memory" if out_of_memory(error) else f"{type(error).__name__}: {one_line(error)}"
+        return f"{sources.a}, {sources.b}: expected files that can be worked on, but got {got}"
 
     def _report(self, outcome: Outcome) -> None:
         self.failed += outcome.kind == "failed"
@@ -344,7 +363,7 @@ def _unlike(output: str, made: str) -> str:
         return str(error)
     try:
         run = json.loads(header.get("selfcorrect/run", ""))
-    except ValueError:
+    except (ValueError, TypeError, RecursionError):  # no JSON, an attribute of another type, brackets without end
         run = None
     if not isinstance(run, dict) or "recipe" not in run:
         return f"{output}: expected an output of selfcorrect sequence, but got another file"
