@@ -14,6 +14,9 @@
 A message is one line: «expected X, but got Y», with the file and the channel named, and the fix.
 """
 
+import re
+import unicodedata
+
 __all__ = [
     "ChannelError",
     "DenoiserError",
@@ -23,7 +26,33 @@ __all__ = [
     "MissingPackageError",
     "SelfcorrectError",
     "SettingsError",
+    "out_of_memory",
+    "printable",
 ]
+
+_NO_MEMORY = re.compile("allocate memory|out of memory|bad_alloc", re.IGNORECASE)
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an exception says that there was no memory left: Python's, NumPy's, or one of torch's allocators."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and bool(_NO_MEMORY.search(str(error))))
+
+
+def printable(text: str) -> str:
+    """Text for a log: what a file put into it moves no cursor and begins no line of its own.
+
+    Control characters, line separators and characters that turn the direction of writing are escaped, as is what is
+    not Unicode; line breaks are left to the caller.
+
+    >>> printable("a channel called \x1b[31mred"), printable("µ → ±")
+    ('a channel called \\x1b[31mred', 'µ → ±')
+    """
+    return "".join(
+        character
+        if unicodedata.category(character) not in ("Cc", "Cf", "Cs", "Zl", "Zp")
+        else character.encode("unicode_escape", "surrogatepass").decode("ascii")
+        for character in text
+    )
 
 
 class SelfcorrectError(Exception):

@@ -14,6 +14,7 @@ from selfcorrect import exr
 from selfcorrect.buffers import FEATURES
 from selfcorrect.correct import COLOR_OUTPUT
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
+from selfcorrect.exr.limits import check_alike
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
 
@@ -44,6 +45,11 @@ class Sources:
     def inputs(self) -> tuple[str | None, ...]:
         """Every file, or None where there is none: the halves, their denoised images, the full denoised image."""
         return self.a, self.b, self.denoised_a, self.denoised_b, self.denoised_full
+
+    @property
+    def paths(self) -> list[str]:
+        """Every file that is named, half a first."""
+        return [path for path in self.inputs if path]
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,7 @@ def load(sources: Sources) -> Loaded:
     """
     _check_distinct(sources)
     stamp = _stamp(sources.a)
+    check_alike(sources.paths)
     half_a, half_b = (_half(path, sources.mapping) for path in (sources.a, sources.b))
     height, width = half_a.buffers["color"].shape[:2]
     if half_b.buffers["color"].shape[:2] != (height, width):
@@ -198,6 +205,7 @@ def load_images(paths: Sequence[str]) -> Images:
         FrameError: sizes do not fit.
     """
     _check_different(paths)
+    check_alike(paths)
     first = exr.load_half(paths[0])
     size = first.buffers["color"].shape[:2]
     colors = [first.buffers["color"], *(_color_of(path, size) for path in paths[1:])]

@@ -6,7 +6,8 @@ from typing import NoReturn
 
 from selfcorrect.cli import bench, combine, compare, demo, frame, inspect, report, sequence
 from selfcorrect.cli.terminal import log
-from selfcorrect.errors import SelfcorrectError, SettingsError
+from selfcorrect.errors import SelfcorrectError, SettingsError, out_of_memory
+from selfcorrect.exr.file import one_line
 
 __all__ = ["main"]
 
@@ -20,6 +21,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         failed: int | None = options.run(options)
     except SelfcorrectError as error:
         log(f"selfcorrect: error: {error}")
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not out_of_memory(error):
+            raise
+        log(f"selfcorrect: error: expected enough memory for this frame, but got: {one_line(error)}; see --maxmem")
         return 2
     except KeyboardInterrupt:
         log("selfcorrect: interrupted; what was not finished is not written")

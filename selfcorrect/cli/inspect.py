@@ -5,6 +5,7 @@ from typing import Any
 
 from selfcorrect import exr
 from selfcorrect.cli.terminal import answer
+from selfcorrect.errors import printable
 
 __all__ = ["add"]
 
@@ -22,4 +23,4 @@ def _inspect(options: argparse.Namespace) -> None:
     if options.json:
         answer(found.to_dict())
     else:
-        print("\n".join(found.lines()))
+        print("\n".join(map(printable, found.lines())))

@@ -15,6 +15,7 @@ from selfcorrect.errors import SettingsError
 from selfcorrect.exr import channels
 from selfcorrect.exr.file import headers
 from selfcorrect.exr.header import Header
+from selfcorrect.exr.limits import check_alike, stored_bytes
 from selfcorrect.files import Sources
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.patches import crops
@@ -63,7 +64,8 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
         extra: how many images stages need beyond the halves.
 
     Raises:
-        FileError: half a cannot be read.
+        FileError: a file cannot be read.
+        FrameError: a file has another size than half a.
         SettingsError: the frame does not fit.
     """
     found = needs(sources, settings, extra=extra)
@@ -88,15 +90,16 @@ def _with_denoiser(found: Needs) -> dict[str, float]:
 
 
 def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
-    """What a frame needs, by the header of half a; both halves are taken to be alike.
+    """What a frame needs, by the headers of all its files.
 
     ``extra`` images beyond the halves are held as they are and denoised.
     """
+    check_alike(sources.paths)
     file, _, layer = sources.a.partition("::")
     parts, stored = headers(file)
     height, width = parts[0].data_window.size
     pixels = height * width
-    held = pixels * sum(_BYTES[channel.type] for part in parts for channel in part.channels)
+    held = max(map(stored_bytes, sources.paths))
     features = _features(sources, parts, layer or None)
     half = pixels * (_RGB + sum(features.values()))
     image = pixels * _RGB

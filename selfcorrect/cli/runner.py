@@ -153,7 +153,7 @@ class Runner:
         }
         seconds = {"read": time.perf_counter() - began}
         if channels != self._told:  # of a shot, only where it changes
-            log("\n".join(facts.channel_lines(channels)))
+            log(*facts.channel_lines(channels))
         self._told = channels
         for doubt in doubts(frame):
             log(f"warning: {doubt}")
@@ -182,7 +182,7 @@ class Runner:
         written = facts.Written(
             output, clipped, {"write": now - start, "total": now - corrected.began}, corrected.facts
         )
-        log("\n".join(written.lines()))  # in one piece: another frame may be in work meanwhile
+        log(*written.lines())  # in one piece: another frame may be in work meanwhile
         return written
 
     def _left(self, spent: float, frame: Frame) -> Settings:

@@ -1,5 +1,6 @@
 """What is told, and where: results on stdout, everything else on stderr; and Ctrl-C."""
 
+import contextlib
 import json
 import os
 import signal
@@ -9,15 +10,18 @@ from typing import Any
 
 from tqdm import tqdm
 
+from selfcorrect.errors import printable
 from selfcorrect.exr.file import OUTPUT
 
 __all__ = ["EndOnInterrupt", "Progress", "answer", "log"]
 
 
-def log(line: str) -> None:
-    """One line on stderr, or several in one piece."""
-    with OUTPUT:
-        print(line, file=sys.stderr, flush=True)
+def log(*lines: str) -> None:
+    """Lines on stderr, in one piece; what files put into them is escaped. Where nothing can be told, so be it."""
+    if sys.stderr is None:  # closed before Python began; print would take stdout
+        return
+    with OUTPUT, contextlib.suppress(OSError, ValueError):
+        print("\n".join(map(printable, lines)), file=sys.stderr, flush=True)
 
 
 def answer(report: Mapping[str, Any]) -> None:
@@ -49,7 +53,8 @@ class EndOnInterrupt:
             raise KeyboardInterrupt
         self._asked = True
         # not log(): its lock may be held by the very thread that this interrupts
-        os.write(2, b"interrupted: writing what has been learned so far; again to write nothing\n")
+        with contextlib.suppress(OSError):
+            os.write(2, b"interrupted: writing what has been learned so far; again to write nothing\n")
 
 
 class Progress:
@@ -74,7 +79,7 @@ class Progress:
         """Tell of an optimiser step."""
         if self._meanwhile is not None:
             self._meanwhile()
-        if sys.stderr.isatty():
+        if sys.stderr is not None and sys.stderr.isatty():
             if self._bar is None:
                 self._bar = tqdm(total=steps, desc="training", unit="step", file=sys.stderr)
             self._bar.set_postfix(loss=f"{loss:.4g}")

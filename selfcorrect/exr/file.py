@@ -39,7 +39,7 @@ __all__ = [
 
 Pixels = NDArray[Any]
 
-LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, IndexError, MemoryError)
+LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, MemoryError)
 """What the OpenEXR library raises for a file or an image that it refuses."""
 
 OUTPUT = threading.RLock()
@@ -183,6 +183,10 @@ def read(path: str | Path) -> ExrFile:
         with quiet():
             stream = io.BytesIO(header.readable(data, headers))
             parts = OpenEXR.File(stream, separate_channels=True).parts
+            if len(parts) == len(headers):
+                read_parts = tuple(map(_part, parts, headers))
+    except MemoryError:
+        raise FileError(f"{file}: expected memory for all its pixels, but got too little; see --maxmem") from None
     except LIBRARY_ERRORS as error:
         raise FileError(
             f"{file}: expected an intact OpenEXR file, but got: {one_line(error)}; render or copy it again"
@@ -192,7 +196,7 @@ def read(path: str | Path) -> ExrFile:
             f"{file}: expected intact pixels in all of {len(headers)} parts, but got them in {len(parts)}: "
             "the file is truncated or damaged; render or copy it again"
         )
-    return ExrFile(file, layer or None, tuple(map(_part, parts, headers)))
+    return ExrFile(file, layer or None, read_parts)
 
 
 def _bytes(file: str) -> bytes:

@@ -54,7 +54,7 @@ def unlike(output: str, made: str) -> str:
         return str(error)
     try:
         run = json.loads(header.get("selfcorrect/run", ""))
-    except ValueError:
+    except (ValueError, TypeError, RecursionError):  # no JSON, an attribute of another type, brackets without end
         run = None
     if not isinstance(run, dict) or "recipe" not in run:
         return f"{output}: expected an output of selfcorrect sequence, but got another file"

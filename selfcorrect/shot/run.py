@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from selfcorrect import exr, files
-from selfcorrect.errors import FileError, SelfcorrectError
+from selfcorrect.errors import FileError, SelfcorrectError, out_of_memory
+from selfcorrect.exr.file import one_line
 from selfcorrect.publish import remove_abandoned
 from selfcorrect.settings import Settings
 from selfcorrect.shot.chain import Chain, Link
@@ -204,7 +205,7 @@ class _Run:
                 frame, fetched = ahead
                 try:
                     there = fetched.result()
-                except SelfcorrectError as error:
+                except Exception as error:
                     ahead = self._ahead(reader, frames)
                     self._fail(frame, error)
                     continue
@@ -262,7 +263,7 @@ class _Run:
         job = Job(frame, output, fetched.loaded, fetched.recipe, link, lambda: self._flush(wait=False))
         try:
             done = self.work(job)
-        except SelfcorrectError as error:
+        except Exception as error:
             self._fail(frame, error)
             return
         self._chain.corrected(done.network)
@@ -280,10 +281,20 @@ class _Run:
         return self._chain.link(loaded.frame)
 
     def _write(self, frame: int, made: str, done: Done) -> Any:
-        """In the writer's thread. The state comes first: there is no output whose successor could not go on from it."""
+        """In the writer's thread. The state comes first: there is no output whose successor could not go on from it.
+
+        But a state that cannot be written loses no image: the frame is written and then reported as failed.
+        """
+        problem = None
         if self.options.save_state is not None and done.network is not None:
-            save_state(self._state_file(frame), State(done.network, frame, made), self.options.settings)
-        return done.write()
+            try:
+                save_state(self._state_file(frame), State(done.network, frame, made), self.options.settings)
+            except (OSError, SelfcorrectError) as error:
+                problem = error
+        report = done.write()
+        if problem is not None:
+            raise FileError(f"{problem}; the image {self.shot.target(frame)} is written")
+        return report
 
     def _state_file(self, frame: int) -> str:
         pattern = str(self.options.save_state)
@@ -295,12 +306,20 @@ class _Run:
             frame, future = self._writing.popleft()
             try:
                 self._report(Outcome(frame, self.shot.target(frame), "written", report=future.result()))
-            except SelfcorrectError as error:
+            except Exception as error:
                 self._fail(frame, error)
 
-    def _fail(self, frame: int, error: SelfcorrectError) -> None:
+    def _fail(self, frame: int, error: Exception) -> None:
+        """Whatever one frame's files make fail ends this frame alone."""
         self._flush()
-        self._report(Outcome(frame, self.shot.target(frame), "failed", str(error)))
+        self._report(Outcome(frame, self.shot.target(frame), "failed", self._reason(frame, error)))
+
+    def _reason(self, frame: int, error: Exception) -> str:
+        if isinstance(error, SelfcorrectError):
+            return str(error)
+        sources = self.shot.sources(frame)
+        got = "too little memory" if out_of_memory(error) else f"{type(error).__name__}: {one_line(error)}"
+        return f"{sources.a}, {sources.b}: expected files that can be worked on, but got {got}"
 
     def _report(self, outcome: Outcome) -> None:
         self.failed += outcome.kind == "failed"

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -48,6 +49,8 @@ def check_state_target(path: str | Path) -> Path:
         raise FileError(f"{path}: expected a state whose name ends in .safetensors, but got '{target.name}'")
     if target.is_dir() or not target.parent.is_dir():
         raise FileError(f"{path}: expected a file in a folder that exists, but got none; create the folder first")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise FileError(f"{path}: expected a state that can be written, but it is read-only; choose another folder")
     return target
 
 

@@ -1,0 +1,153 @@
+"""What odd files do to the command: one line that names them, nothing else; and the frames beside them go on."""
+
+import io
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from helpers.commands import BALANCED
+from helpers.exr_files import raw
+from helpers.shots import Run, arguments
+
+from selfcorrect import cli, exr
+from selfcorrect.errors import printable
+
+Captured = pytest.CaptureFixture[str]
+
+
+def refused(capfd: Captured, *given: object) -> str:
+    capfd.readouterr()
+    assert cli.main([*map(str, given)]) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    (line,) = [line for line in err.splitlines() if line.startswith("selfcorrect: error: ")]
+    return line
+
+
+@pytest.mark.parametrize(
+    "attribute",
+    [
+        ("framesPerSecond", "rational", struct.pack("<iI", 24, 0)),
+        ("chromaticities", "int", struct.pack("<i", 3)),
+        ("multiView", "int", struct.pack("<i", 1)),
+    ],
+)
+def test_an_odd_attribute_ends_one_frame_at_most(
+    attribute: tuple[str, str, bytes], shot_folder: Path, sequence: Run
+) -> None:
+    (shot_folder / "a.0002.exr").write_bytes(raw([attribute]))
+    (shot_folder / "b.0002.exr").write_bytes(raw())
+    code, log, frames = sequence(arguments(shot_folder, last=3))
+    assert code == 1
+    assert [f["outcome"] for f in frames] == ["written", "failed", "written"]
+    assert "0002.exr" in frames[1]["reason"]
+    assert "Traceback" not in log
+
+
+@pytest.mark.parametrize("run", [3.0, "[" * 100_000, "{", "[]"])
+def test_an_odd_output_is_made_again(run: Any, shot_folder: Path, sequence: Run) -> None:
+    given = arguments(shot_folder, "--skip-existing", last=2)
+    channels = {name: np.zeros((4, 5), np.float16) for name in "RGB"}
+    OpenEXR.File({"selfcorrect/run": run}, channels).write(str(shot_folder / "out" / "x.0001.exr"))
+    code, log, frames = sequence(given)
+    assert code == 0
+    assert [f["outcome"] for f in frames] == ["written", "written"]
+    assert "expected an output of selfcorrect sequence, but got another file" in log
+
+
+def test_any_exception_is_that_of_its_frame(shot_folder: Path, sequence: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def odd(sources: Any) -> Any:
+        if "0002" in sources.a:
+            raise KeyError("odd")
+        return load(sources)
+
+    load = cli.files.load
+    monkeypatch.setattr("selfcorrect.files.load", odd)
+    code, _, frames = sequence(arguments(shot_folder, last=3))
+    assert code == 1
+    assert [f["outcome"] for f in frames] == ["written", "failed", "written"]
+    assert "a.0002.exr" in frames[1]["reason"]
+
+
+def test_a_file_of_another_size_is_refused_by_its_header(
+    halves: tuple[Path, Path], tmp_path: Path, capfd: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some kilobytes that hold a hundred million pixels."""
+    bomb = tmp_path / "bomb.exr"
+    wide = (0, 0, 11_999, 9_999)
+    bomb.write_bytes(raw(window=wide)[:4096])
+    monkeypatch.setattr("selfcorrect.exr.load.read", lambda _: pytest.fail("pixels were read"))
+    out = ("-o", tmp_path / "out.exr", *BALANCED)
+    for more in ([], ["--maxmem", "2G"]):
+        line = refused(capfd, "frame", halves[0], bomb, *out, *more)
+        assert "bomb.exr: expected 30x24 pixels like" in line
+        denoised = ["--denoised-a", bomb, "--denoised-b", halves[1]]
+        assert "bomb.exr: expected 30x24 pixels like" in refused(capfd, "frame", *halves, *denoised, *out, *more)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: …\nat …")])
+def test_too_little_memory_is_one_line(
+    error: Exception, halves: tuple[Path, Path], tmp_path: Path, capfd: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> torch.Tensor:
+        raise error
+
+    monkeypatch.setattr("selfcorrect.cli.runner.correct", full)
+    line = refused(capfd, "frame", *halves, "-o", tmp_path / "out.exr", *BALANCED)
+    assert "expected enough memory for this frame" in line
+    assert not (tmp_path / "out.exr").exists()
+
+
+def test_names_from_a_file_begin_no_line_and_move_no_cursor(tmp_path: Path, capfd: Captured) -> None:
+    name = "a\nopenjd_fail: \x1b[31mboo\u202e.R"
+    channels = {n: np.zeros((4, 5), np.float16) for n in (*"RGB", name)}
+    OpenEXR.File({}, channels).write(str(tmp_path / "a.exr"))
+    assert cli.main(["inspect", str(tmp_path / "a.exr")]) == 0
+    shown = capfd.readouterr().out
+    assert "\\nopenjd_fail: \\x1b[31mboo\\u202e" in shown
+    assert not any(line.startswith("openjd_fail") for line in shown.splitlines())
+    line = refused(
+        capfd, "frame", tmp_path / "a.exr", tmp_path / "none.exr", "-o", tmp_path / "o.exr", "--map", "albedo=x"
+    )
+    assert "\x1b" not in line
+
+
+def test_what_is_printable_stays() -> None:
+    assert printable("µ → ± 画像 'x'") == "µ → ± 画像 'x'"
+    assert printable("a\tb\r\x9b\u2028\udcff") == "a\\tb\\r\\x9b\\u2028\\udcff"
+
+
+def test_a_state_that_cannot_be_written_loses_no_image(
+    shot_folder: Path, sequence: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("selfcorrect.shot.run.save_state", full)
+    state = shot_folder / "state.safetensors"
+    code, _, frames = sequence(arguments(shot_folder, "--save-state", state, last=2))
+    assert code == 1
+    assert [f["outcome"] for f in frames] == ["failed", "failed"]
+    assert "No space left" in frames[0]["reason"]
+    assert "x.0001.exr is written" in frames[0]["reason"]
+    for frame in (1, 2):
+        assert np.isfinite(exr.read(str(shot_folder / "out" / f"x.000{frame}.exr")).pixels("R")).all()
+
+
+def test_nothing_can_be_told_but_the_picture_is_written(
+    halves: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(io.StringIO):
+        def write(self, _: str) -> int:
+            raise OSError(28, "No space left on device")
+
+    for name, stream in (("full", Full()), ("none", None)):
+        monkeypatch.setattr("sys.stderr", stream)
+        assert cli.main(["frame", *map(str, halves), "-o", str(tmp_path / f"{name}.exr"), *BALANCED]) == 0
+    monkeypatch.undo()
+    for name in ("full", "none"):
+        assert np.isfinite(exr.read(str(tmp_path / f"{name}.exr")).pixels("R")).all()
