@@ -36,8 +36,7 @@ def make() -> Make:
         }
         frame = Frame(**buffers)
         half, settings = frame.halves[0], Settings(layers=2, filters=2)
-        seen = {name: getattr(half, name) for name in features if name != "depth"}
-        guides = Guides.of_half(half.color, half.denoised, margin=9, **seen)
+        guides = Guides.of_half(half._asdict(), margin=9)
         return frame, Network.for_guides(guides, settings, torch.Generator().manual_seed(0))
 
     return one
