@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from selfcorrect import Frame, Settings
+from selfcorrect.errors import FrameError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -70,7 +71,14 @@ def test_anything_in_finite_out(data: st.DataObject, size: tuple[int, int], guid
         channels = 1 if name in ("visibility", "depth") else 3
         image = arrays(np.float32, (*size, channels), elements=any_float, fill=any_float)
         buffers[name] = (data.draw(image), data.draw(image))
-    corrected(Frame(**buffers), BRIEF)
+    try:
+        frame = Frame(**buffers)
+    except FrameError as error:
+        assert "expected finite radiance at 50% of the pixels or more" in str(error)
+        share = min(np.isfinite(image).mean((0, 1)).min() for name in ("color", "denoised") for image in buffers[name])
+        assert share < 0.5
+    else:
+        corrected(frame, BRIEF)
 
 
 @FEW

@@ -117,7 +117,7 @@ def test_halves_that_share_their_noise_give_the_denoised_image_and_no_claim(shar
     assert not result.estimate.independent
     assert (result.estimate.change, result.network, result.losses) == (0.0, None, [])
     assert "another seed" in str(result.estimate)
-    assert all(aov.eq(0).all() for aov in result.aovs.values())
+    assert all(aov.eq(0).all() for aov in result.maps.values())
 
 
 def test_the_published_method_is_left_as_it_is() -> None:

@@ -87,7 +87,8 @@ def test_estimate_and_its_maps(halves: tuple[Path, Path], tmp_path: Path) -> Non
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     assert report["preset"] == Settings.default()
-    assert set(report["estimate"]) == {"noisy", "denoised", "corrected", "change", "standard_error", "improved"}
+    known = {"noisy", "denoised", "corrected", "change", "standard_error", "improved", "independent"}
+    assert set(report["estimate"]) == known
     assert "relMSE ≈ " in result.stderr
     after = exr.read(str(out))
     assert json.loads(after.parts[0].header["selfcorrect/run"])["estimate"] == report["estimate"]
