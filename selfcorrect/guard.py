@@ -220,7 +220,8 @@ def guard(
 
     gain = tile_means(size[0], gains)
     # More than chance, in the weights that decide and in those of the metric.
-    improved = all(_more_than_chance(tiles) for tiles in gain)
+    means = average(gain, size)
+    improved = all(mean > 0 and _more_than_chance(tiles) for mean, tiles in zip(means, gain, strict=True))
 
     alpha = _pooled(size, evidence.both, count) if improved else gain.new_zeros(count, 1, 1)
     for rows in bands(size[0]):
