@@ -1,7 +1,7 @@
 """Tolerances of exposure, swapped halves and the loss, the worst case measured beside each; none above ten times it.
 
-Measured on an AVX2 processor over the tests' own cases and one to two more seeds of most. Bounds of other tests stand in
-those tests.
+Measured on an AVX2 processor over the tests' own cases and one to two more seeds of most. Bounds of other tests stand
+in those tests.
 """
 
 # Of a frame's mean: another exposure, all steps of the balanced preset through training and guard. Factors 1e-4 … 1e36.
