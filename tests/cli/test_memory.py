@@ -75,10 +75,11 @@ def test_the_command_takes_no_more_than_is_told(tmp_path: Path) -> None:
 def eight_k(folder: Path, dtype: type) -> Sources:
     """Files whose headers say that they are of 8K."""
     frame = sources(folder, dtype=dtype)
-    data = bytearray(Path(frame.a).read_bytes())
-    (header,), _ = exrheader.parse(bytes(data), frame.a)
-    struct.pack_into("<4i", data, header.attributes["dataWindow"].offset, 0, 0, 7679, 4319)
-    Path(frame.a).write_bytes(data)
+    for path in (frame.a, frame.b):
+        data = bytearray(Path(path).read_bytes())
+        (header,), _ = exrheader.parse(bytes(data), path)
+        struct.pack_into("<4i", data, header.attributes["dataWindow"].offset, 0, 0, 7679, 4319)
+        Path(path).write_bytes(data)
     return frame
 
 
