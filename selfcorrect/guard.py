@@ -193,7 +193,7 @@ def _place(k: int, m: int, candidates: int) -> int:
 def guard(
     evidence: Evidence, denoised_full: Radiance, images: Sequence[Radiance], *, scale: float = 1.0, out: Tensor
 ) -> Guarded:
-    """Blend candidates into the denoised image as far as the halves bear them out.
+    """Blend candidates into the denoised image as far as the halves confirm them.
 
     Args:
         evidence: of every row.

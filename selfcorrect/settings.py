@@ -131,7 +131,7 @@ class Settings:
         "none",
         "further denoised images, of the denoiser's other modes, that the guard may blend in: none; auto, those that a "
         "few crops ask for; or all",
-        "not in the paper; scripts/bench/candidates.py measures it",
+        "not in the paper; scripts/bench/quality.py measures it",
         choices=("none", "auto", "all"),
     )
     time_budget: float = _setting(

@@ -1,7 +1,7 @@
 """Sums over a window with weights that differ at every pixel, as the predicted kernels need them.
 
 Gathering the window (unfold) would hold window² copies of the image: 59 MB a channel for four patches of 128×128, in
-single precision. :func:`windowed_sum` walks over shifted views instead, on the way back too, so that nothing is held
+single precision. :func:`windowed_sum` walks over shifted views instead, backward too, so that nothing is held
 beside the weights and their gradient. :func:`windowed_sum_reference` is the readable one.
 """
 

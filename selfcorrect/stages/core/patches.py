@@ -51,7 +51,7 @@ def steps_count(size: tuple[int, int], settings: Settings) -> int:
 def most_steps(size: tuple[int, int], settings: Settings) -> int:
     """How many steps a frame of this size can bear, at least 1.
 
-    20,303 weights can learn the noise of a small frame by heart, and that of the witness with it, which the guard then
+    20,303 weights can overfit the noise of a small frame, and that of the witness with it, which the guard then
     takes for a gain: on 128×128 pixels 400 steps of four 64×64 patches, 400 visits to each pixel, made frames twice
     worse, and the guard believed it. So the settings bound how often a pixel is visited.
     """
