@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from selfcorrect.correct import Result
 from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
+from selfcorrect.history import History
 from selfcorrect.image.repair import Repairs
 from selfcorrect.settings import Settings
 from selfcorrect.stages.stage import Start
@@ -36,6 +37,7 @@ class Denoised:
         seconds: of reading and denoising.
         promises: by name of a further denoiser, the share of the error that its image promised to take off.
         candidates: the further images that the guard may blend in.
+        history: what the neighbours of a frame of a shot gave; None where they were not asked.
     """
 
     denoiser: str
@@ -46,6 +48,7 @@ class Denoised:
     seconds: Mapping[str, float]
     promises: Mapping[str, float] = field(default_factory=dict)
     candidates: tuple[str, ...] = ()
+    history: History | None = None
 
     @classmethod
     def of(
@@ -55,7 +58,6 @@ class Denoised:
         channels: Mapping[str, list[str]],
         seconds: Mapping[str, float],
         repairs: Mapping[str, Repairs],
-        promises: Mapping[str, float] | None = None,
     ) -> "Denoised":
         """Those of a denoised frame; ``repairs`` are those of images beyond its buffers."""
         return cls(
@@ -65,9 +67,20 @@ class Denoised:
             {**frame.repairs, **repairs},
             list(frame.constant),
             dict(seconds),
-            dict(promises or {}),
-            tuple(candidate.name for candidate in frame.more),
         )
+
+    def judged(self, frame: Frame, promises: Mapping[str, float], seconds: float) -> "Denoised":
+        """Those of the frame with the candidates of further denoisers, and what each had promised."""
+        return replace(
+            self,
+            promises=dict(promises),
+            candidates=tuple(candidate.name for candidate in frame.more),
+            seconds={**self.seconds, "candidates": seconds},
+        )
+
+    def remembered(self, history: History, seconds: float) -> "Denoised":
+        """Those of the frame with its history."""
+        return replace(self, history=history, seconds={**self.seconds, "history": seconds})
 
     def lines(self) -> list[str]:
         """For the log: what was not used, and what was repaired."""
@@ -82,7 +95,7 @@ class Denoised:
             f"{100 * promise:.0f} % less error"
             for name, promise in self.promises.items()
         ]
-        return unused + repaired + further
+        return unused + repaired + further + ([] if self.history is None else self.history.lines())
 
 
 @dataclass(frozen=True)
@@ -197,6 +210,7 @@ class Written:
                 name: {"promise": promise, "taken": name in before.candidates}
                 for name, promise in before.promises.items()
             },
+            "history": None if before.history is None else before.history.to_dict(),
             "input_scale": facts.input_scale,
             "steps": facts.steps,
             "parameters": facts.parameters,

@@ -1,6 +1,6 @@
 """The half buffers of one frame: shapes and values are checked and repaired once, here."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -16,6 +16,7 @@ from selfcorrect.image.repair import Repairs, as_tensor, check_finite, repair
 __all__ = ["Candidate", "DualDenoiser", "Frame", "Half", "checked", "mean", "prefiltered"]
 
 Pair = tuple[Any, Any]
+Aids = tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]
 _DENOISED_FULL = "denoised_full"
 
 
@@ -78,6 +79,10 @@ class Frame:
         denoised_full: the denoised mean of both halves, a single array.
         more: further images of the frame that the guard may blend in, finite and ≥ 0.
 
+    Attributes:
+        aids: what the denoiser was given beside the colours of both halves together, of half a and of half b, where
+            :meth:`denoise` was asked to keep it.
+
     Raises:
         FrameError: sizes or channel counts do not fit, or a channel of radiance is NaN or infinite at more than half
             of its pixels.
@@ -93,6 +98,7 @@ class Frame:
     more: tuple[Candidate, ...] = ()
     repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
     constant: list[str] = field(init=False, default_factory=list)
+    aids: "Aids | None" = field(init=False, default=None)
     _like: Any = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -160,7 +166,7 @@ class Frame:
         full = mean(self.denoised) if self.denoised_full is None else self.denoised_full
         return Candidate("denoised", self.denoised, full), *self.more
 
-    def denoise(self, denoiser: Callable[..., Any], *, full: bool = True) -> "Frame":
+    def denoise(self, denoiser: Callable[..., Any], *, full: bool = True, keep_aids: bool = False) -> "Frame":
         """This frame with each half denoised on its own, with its own G-buffers.
 
         Args:
@@ -169,19 +175,33 @@ class Frame:
                 ``denoiser.pair(color, albedo=…, normal=…, depth=…, visibility=…)`` with pairs. If it has a method
                 ``prefilter``, that is called as in :func:`prefiltered`.
             full: also denoise the mean of the halves; with a dual denoiser it is the mean of the denoised halves.
+            keep_aids: keep what the denoiser was given beside the colours, for more to be denoised alike; a dual
+                denoiser leaves nothing to keep.
         """
         if getattr(denoiser, "dual", False):
             features = {buffer.name: getattr(self, buffer.name) for buffer in FEATURES}
             pair = cast(DualDenoiser, denoiser).pair(self.color, **features)
             return self.with_denoised(pair, mean(pair) if full else None)
-        inputs = [(h.color, h.albedo, h.normal) for h in self.halves]
-        denoised_full = None
-        if full:  # first: there is no other denoised image in memory yet
-            color, albedo, normal = (None if a is None else mean((a, b)) for a, b in zip(*inputs, strict=True))
-            denoised_full = denoiser(color, **prefiltered(denoiser, albedo, normal))
-            del color, albedo, normal
-        pair = tuple(denoiser(color, **prefiltered(denoiser, albedo, normal)) for color, albedo, normal in inputs)
-        return self.with_denoised(pair, denoised_full)
+        source = self.with_aids(denoiser) if keep_aids else self
+
+        def one(part: int, color: Tensor) -> Any:
+            return denoiser(color, **(source.aids[part] if source.aids else source._aids(denoiser, part)))
+
+        # first of both halves together: there is no other denoised image in memory yet
+        denoised_full = one(0, mean(self.color)) if full else None
+        return source.with_denoised((one(1, self.color[0]), one(2, self.color[1])), denoised_full)
+
+    def with_aids(self, denoiser: Callable[..., Any]) -> "Frame":
+        """This frame with what the denoiser is given beside the colours, for images that are to be denoised later."""
+        frame = self._copy()
+        object.__setattr__(frame, "aids", tuple(self._aids(denoiser, part) for part in (0, 1, 2)))
+        return frame
+
+    def _aids(self, denoiser: Callable[..., Any], part: int) -> dict[str, Any]:
+        """What goes with the colour of both halves together, 0, or of half a or b, 1 or 2."""
+        pairs = (self.albedo, self.normal)
+        albedo, normal = (None if p is None else p[part - 1] if part else mean(p) for p in pairs)
+        return prefiltered(denoiser, albedo, normal)
 
     def with_denoised(self, denoised: Pair, denoised_full: Any = None) -> "Frame":
         """This frame with these denoised images; its other buffers are not checked again."""
@@ -209,6 +229,7 @@ class Frame:
             Candidate(c.name, (c.halves[0].to(device), c.halves[1].to(device)), c.full.to(device)) for c in self.more
         ]
         object.__setattr__(frame, "more", tuple(moved))
+        object.__setattr__(frame, "aids", None)  # denoisers have had them
         return frame
 
     def _copy(self) -> "Frame":

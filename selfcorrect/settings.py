@@ -134,6 +134,11 @@ class Settings:
         "not in the paper; scripts/bench/quality.py measures it",
         choices=("none", "auto", "all"),
     )
+    frame_radius: int = _setting(
+        0,
+        "of a shot: how many frames on either side give their samples to the candidate history; 0 takes none",
+        "not in the paper; scripts/bench/shot.py measures it",
+    )
     time_budget: float = _setting(
         0.0, "seconds for the whole frame: training takes what the rest leaves; 0 sets none", "the user's", unit="s"
     )
@@ -188,6 +193,7 @@ class Settings:
             crossed_weights=True,
             precision="bf16",
             candidates="auto",
+            frame_radius=2,
         )
         return {
             "balanced": balanced,

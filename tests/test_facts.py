@@ -63,6 +63,7 @@ def test_json() -> None:
         ("repairs", {"color": {"non_finite": 3, "negative": 1}, "depth": {"non_finite": 0, "negative": 0}}),
         ("constant", ["albedo"]),
         ("candidates", {"oidn:none": {"promise": 0.25, "taken": True}, "oidn:fast": {"promise": 0.0, "taken": False}}),
+        ("history", None),
         ("input_scale", 2.0),
         ("steps", 17),
         ("parameters", 20303),

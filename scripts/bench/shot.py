@@ -3,8 +3,9 @@
     .venv/bin/python scripts/bench/shot.py ../shared/shot [--preset balanced] [--variants cold warm warm:steps=50 key]
 
 Variants: ``cold`` (each frame on its own), ``warm`` (each from the last one's network, with the preset's settings for
-that), ``key`` (each from the first frame's network), and any of them with settings changed: ``warm:warm_steps=50``,
-commas between several. Prints relMSE of noisy, denoised and each variant for every frame, with the mean radiance over
+that), ``key`` (each from the first frame's network), ``history`` (warm, with the samples of the neighbours that are in
+the folder; ``candidate`` is its image before any guard), and any of them with settings changed:
+``warm:warm_steps=50``, commas between several; ``history:frame_radius=1`` takes fewer neighbours. Prints relMSE of noisy, denoised and each variant for every frame, with the mean radiance over
 that of the smooth reference, the mean over the frames after the first (which is cold in any case), and the temporal
 error (:func:`selfcorrect.metrics.temporal_error`), the mean over all pairs of neighbours.
 """
@@ -19,6 +20,7 @@ import torch
 
 import denoisers
 from selfcorrect import Frame, Settings, correct, exr, metrics
+from selfcorrect.history import Histories
 
 ROLES = ("color", "albedo", "normal", "visibility", "depth")
 
@@ -33,18 +35,26 @@ def load(folder: Path, number: int, denoiser: str, threads: int) -> tuple[Frame,
     a, b = (exr.load_half(file(half)).buffers for half in "ab")
     references = [exr.load_half(file(f"ref_{r}")).buffers["color"] for r in ("a", "b", "smooth")]
     frame = Frame(**{role: (a[role], b[role]) for role in ROLES if role in a})
-    return frame.denoise(denoisers.create(denoiser, threads=threads)), references
+    return frame.denoise(denoisers.create(denoiser, threads=threads), keep_aids=True), references
 
 
-def corrected(frames: list[Frame], preset: str, variant: str) -> tuple[list[Any], list[float]]:
+def corrected(frames: list[Frame], preset: str, variant: str, denoiser: Any) -> tuple[list[Any], list[float]]:
     """Images of one variant, and seconds of each."""
     how, _, changes = variant.partition(":")
     pairs = dict(change.split("=") for change in changes.split(",") if change)
     settings = Settings.preset(preset, **{k: int(v) if v.isdigit() else float(v) for k, v in pairs.items()})
     images, seconds, last, first = [], [], None, None
-    for frame in frames:
+    histories = Histories(settings.frame_radius if how in ("history", "candidate") else 0, denoiser)
+    for number, frame in enumerate(frames):
         start = time.process_time()
-        result = correct(frame, settings, warm_start={"cold": None, "warm": last, "key": first}[how])
+        if histories.reach:
+            around = {n: f for n, f in enumerate(frames) if abs(n - number) <= histories.reach}
+            frame, _ = histories.of(number, around)
+        if how == "candidate":
+            images.append(frame.candidates[-1].full)
+            seconds.append(time.process_time() - start)
+            continue
+        result = correct(frame, settings, warm_start={"cold": None, "key": first}.get(how, last))
         last, first = result.network, first or result.network
         images.append(result.image)
         seconds.append(time.process_time() - start)
@@ -61,20 +71,26 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     numbers = sorted(int(p.name.split(".")[-2]) for p in options.folder.glob("*_ref_smooth.*.exr"))
+    denoiser = denoisers.create(options.denoiser, threads=options.threads)
     loaded = [load(options.folder, number, options.denoiser, options.threads) for number in numbers]
     frames, references = [frame for frame, _ in loaded], [reference for _, reference in loaded]
     print(f"preset {options.preset}, denoiser {options.denoiser}: relMSE (mean radiance) of each frame; CPU seconds")
     print(f"| | {' | '.join(map(str, numbers))} | after the first | temporal | seconds |")
     print(f"|---|{'---|' * (len(numbers) + 3)}")
     row("noisy", [np.asarray((f.color[0] + f.color[1]) / 2) for f in frames], references, [0.0])
-    row(options.denoiser, [f.denoised_full for f in frames], references, [0.0])
+    denoised = row(options.denoiser, [f.denoised_full for f in frames], references, [0.0])
     for variant in options.variants:
-        images, seconds = corrected(frames, options.preset, variant)
-        row(variant, images, references, seconds[1:])
+        images, seconds = corrected(frames, options.preset, variant, denoiser)
+        found = row(variant, images, references, seconds[1:])
+        each = [a / b for a, b in zip(found[0], denoised[0], strict=True)]
+        of = f"of {options.denoiser}: {' '.join(f'{ratio:.3f}' for ratio in each)}, mean {np.mean(each):.3f}"
+        print(f"{variant}, {of}, temporal {found[1] / denoised[1]:.3f}", flush=True)
 
 
-def row(name: str, images: list[Any], references: list[list[np.ndarray]], seconds: list[float]) -> None:
-    """Print one row of the table."""
+def row(
+    name: str, images: list[Any], references: list[list[np.ndarray]], seconds: list[float]
+) -> tuple[list[float], float]:
+    """Print one row of the table; its errors and the temporal one are returned."""
     errors = [metrics.relmse(image, *reference) for image, reference in zip(images, references, strict=True)]
     means = [metrics.mean_radiance_ratio(image, r[2]) for image, r in zip(images, references, strict=True)]
     flicker = []
@@ -85,6 +101,7 @@ def row(name: str, images: list[Any], references: list[list[np.ndarray]], second
     print(
         f"| {name} | {each} | {np.mean(errors[1:]):.5f} | {np.mean(flicker):.5f} | {np.mean(seconds):.1f} |", flush=True
     )
+    return errors, float(np.mean(flicker))
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ def _frame(options: argparse.Namespace, runner: Runner, halves: Sequence[str], *
     denoised = flags.denoised(options) if given else {}
     start = time.perf_counter()
     loaded = files.load(files.Sources(halves[0], halves[1], **denoised, mapping=flags.mapping(options)))
-    prepared = runner.prepare(loaded, start)
+    prepared = runner.prepare(runner.denoise(loaded, start))
     log(f"read and denoised ({prepared.facts.denoiser}) in {time.perf_counter() - start:.1f} s")
     return prepared.frame.to(options.device)
 

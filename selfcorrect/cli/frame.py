@@ -69,5 +69,6 @@ def correct_files(
     runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
     remove_abandoned(exr.check_target(output).parent)
     with EndOnInterrupt() as stop:
-        corrected = runner.correct(files.load(sources), began=start, show=show, stop=stop, gather=gather)
+        denoised = runner.denoise(files.load(sources), start)
+        corrected = runner.correct(denoised, show=show, stop=stop, gather=gather)
         return runner.write(output, corrected)

@@ -4,7 +4,7 @@ import argparse
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -14,24 +14,36 @@ from selfcorrect.candidates import with_candidates
 from selfcorrect.cli import flags
 from selfcorrect.cli.terminal import Progress, log
 from selfcorrect.correct import COLOR_OUTPUT, Result, correct
-from selfcorrect.errors import SettingsError
+from selfcorrect.errors import MissingPackageError, SettingsError
 from selfcorrect.frame import Frame
+from selfcorrect.history import Histories, available
 from selfcorrect.independence import doubts
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.stage import Extra, Images
 
-__all__ = ["Corrected", "Prepared", "Runner"]
+__all__ = ["Corrected", "Denoised", "Runner"]
 
 _WRITE_SECONDS = 5e-7  # a pixel
 
 
-class Prepared(NamedTuple):
-    """A frame with its denoised halves; by name of a stage, what that needs beyond them; and what is known of both."""
+@dataclass(frozen=True, eq=False)
+class Denoised:
+    """A frame to be corrected.
+
+    Attributes:
+        frame: with its denoised halves.
+        origin: its half a.
+        extra: by name of a stage, what that needs beyond the halves.
+        facts: what is known of it.
+        began: when the work on it began, by ``time.perf_counter``.
+    """
 
     frame: Frame
+    origin: files.Origin
     extra: dict[str, Images]
     facts: facts.Denoised
+    began: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,32 +113,38 @@ class Runner:
     def _spec(self) -> str:
         return self._options.denoiser or denoisers.default()
 
+    def histories(self) -> Histories:
+        """What makes histories of a shot's frames, as the settings say; without optical flow there are none."""
+        if self.settings.frame_radius and not available():
+            missing = MissingPackageError("optical flow", "flow")
+            log(f"warning: the frames of the shot do not help each other, --frame-radius is 0: {missing}")
+            self.settings = replace(self.settings, frame_radius=0)
+        return Histories(self.settings.frame_radius if self.settings.guard else 0, self._denoise)
+
     def correct(
         self,
-        loaded: files.Loaded,
+        denoised: Denoised,
         network: Network | None = None,
         meanwhile: Callable[[], None] | None = None,
         *,
-        began: float | None = None,
         stop: Callable[[], bool] | None = None,
         show: Callable[[Frame], None] | None = None,
         gather: Callable[[Frame, Result], None] | None = None,
         more: Mapping[str, Any] | None = None,
     ) -> Corrected:
-        """Denoise and correct a frame.
+        """Correct a frame, with what further candidates it has use for.
 
         Args:
-            loaded: it, as read; its frame is given up.
+            denoised: it; its frame is given up.
             network: to start from.
             meanwhile: called after every optimiser step.
-            began: when the work on it began.
             stop: says when to end training.
             show: called with the denoised frame.
             gather: called with it and the result.
             more: what else to keep in the output's attributes.
         """
-        began = time.perf_counter() if began is None else began
-        frame, extra, known = self.prepare(loaded, began)
+        denoised = self.prepare(denoised)
+        frame, origin, began, known = denoised.frame, denoised.origin, denoised.began, denoised.facts
         if show is not None:
             show(frame)
         with Progress(meanwhile) as progress:
@@ -137,42 +155,56 @@ class Runner:
                 progress=progress,
                 stop=stop,
                 opened=self._stages,
-                extra=extra,
+                extra=denoised.extra,
             )
         if gather is not None:
             gather(frame, result)
         corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, more)
-        return Corrected(loaded.origin, _outputs(result, self._options.aov), result.network, corrected, began)
+        return Corrected(origin, _outputs(result, self._options.aov), result.network, corrected, began)
 
-    def prepare(self, loaded: files.Loaded, began: float) -> Prepared:
-        """Read what stages need beyond the halves, denoise where that is to be done, and tell of it."""
+    def denoise(self, loaded: files.Loaded, began: float | None = None, *, keep_aids: bool = False) -> Denoised:
+        """Read what stages need beyond the halves, and denoise where that is to be done.
+
+        Args:
+            loaded: the frame, as read; it is given up.
+            began: when the work on it began.
+            keep_aids: as for :meth:`selfcorrect.Frame.denoise`.
+        """
+        began = time.perf_counter() if began is None else began
         frame, channels = loaded.frame, loaded.origin.taken
         extra = {
             name: _extra(name).of(frame, files.load_extra(paths, frame.size))
             for name, paths in self._extra_files.items()
         }
         seconds = {"read": time.perf_counter() - began}
-        if channels != self._told:  # of a shot, only where it changes
-            log(*facts.channel_lines(channels))
-        self._told = channels
-        for doubt in doubts(frame):
-            log(f"warning: {doubt}")
-        denoiser, promises = "given", dict[str, float]()
+        denoiser = "given"
         if frame.denoised is None or self._options.denoiser is not None:  # who is named beats files found beside
             denoiser, start = self.denoiser, time.perf_counter()
-            log(f"denoiser: {denoiser}")
             assert self._denoise is not None  # created above, in every case that gets here
-            frame = frame.denoise(self._denoise, full=frame.denoised_full is None)
+            frame = frame.denoise(self._denoise, full=frame.denoised_full is None, keep_aids=keep_aids)
             extra = {name: images.denoise(frame, self._denoise) for name, images in extra.items()}
-            frame, promises = with_candidates(frame, self._further, every=self.settings.candidates == "all")
             seconds["denoise"] = time.perf_counter() - start
         else:
             self._check_denoiser(" as the halves' files hold denoised images and those of both must be alike,")
         repairs = {name: counts for images in extra.values() for name, counts in images.repairs.items()}
-        known = facts.Denoised.of(frame, denoiser, channels, seconds, repairs, promises)
+        known = facts.Denoised.of(frame, denoiser, channels, seconds, repairs)
+        return Denoised(frame, loaded.origin, extra, known, began)
+
+    def prepare(self, denoised: Denoised) -> Denoised:
+        """The frame with further candidates, where they are worth it; and tell of all that is known of it."""
+        frame, known, begun = denoised.frame, denoised.facts, time.perf_counter()
+        if known.channels != self._told:  # of a shot, only where it changes
+            log(*facts.channel_lines(known.channels))
+        self._told = dict(known.channels)
+        for doubt in doubts(frame):
+            log(f"warning: {doubt}")
+        if known.denoiser != "given":
+            log(f"denoiser: {known.denoiser}")
+            frame, promises = with_candidates(frame, self._further, every=self.settings.candidates == "all")
+            known = known.judged(frame, promises, time.perf_counter() - begun)
         for line in known.lines():
             log(line)
-        return Prepared(frame, extra, known)
+        return replace(denoised, frame=frame, facts=known)
 
     def write(self, output: str, corrected: Corrected) -> facts.Written:
         """Write a frame, and tell of it."""

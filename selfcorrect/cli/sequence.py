@@ -1,13 +1,16 @@
 """The command `sequence`: the frames of a shot, from files to files."""
 
 import argparse
+import time
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from selfcorrect import files
 from selfcorrect.cli import flags, pages
-from selfcorrect.cli.runner import Runner
+from selfcorrect.cli.runner import Denoised, Runner
 from selfcorrect.cli.terminal import answer, log
-from selfcorrect.errors import FrameError
+from selfcorrect.errors import FrameError, SelfcorrectError
 from selfcorrect.settings import Settings
 from selfcorrect.shot import run as shot
 from selfcorrect.shot.framerange import parse_frames
@@ -54,6 +57,7 @@ def _sequence(options: argparse.Namespace) -> int:
     )
     page = pages.ShotPage.at(options.report, frames)
     runner = Runner(options, given=options.denoised_a is not None)
+    around = _Around(runner)
     how = shot.Options(
         runner.settings,
         {"denoiser": runner.denoiser, "aov": options.aov},
@@ -62,12 +66,13 @@ def _sequence(options: argparse.Namespace) -> int:
         warm_start=None if options.warm_start is None else _given(options.warm_start, runner.settings),
         save_state=options.save_state,
         fail_fast=options.fail_fast,
+        reach=around.reach,
     )
 
     def one(job: shot.Job) -> shot.Done:
         more = {"frame": job.frame, "recipe": job.recipe}
         gather = None if page is None else page.gather(job.frame)
-        corrected = runner.correct(job.loaded, job.link.network, job.meanwhile, gather=gather, more=more)
+        corrected = runner.correct(around.denoised(job), job.link.network, job.meanwhile, gather=gather, more=more)
         log(f"frame {job.frame}: {corrected.facts.start_line()}")
         return shot.Done(corrected.network, partial(runner.write, job.output, corrected))  # the frame is let go
 
@@ -90,6 +95,47 @@ def _sequence(options: argparse.Namespace) -> int:
     if failed:
         log(f"selfcorrect: {failed} of {len(frames)} frames failed")
     return failed
+
+
+class _Around:
+    """The frames around the one in work, each denoised once, and what they give to it."""
+
+    def __init__(self, runner: Runner):
+        self._runner = runner
+        self._histories = runner.histories()
+        self._known: dict[int, Denoised | SelfcorrectError] = {}
+
+    @property
+    def reach(self) -> int:
+        """How many frames on either side are needed."""
+        return self._histories.reach
+
+    def denoised(self, job: shot.Job) -> Denoised:
+        """The frame of a job, with its history where there is to be one."""
+        began = time.perf_counter()
+        if not self.reach:
+            return self._runner.denoise(job.loaded, began)
+        self._known = {n: known for n, known in self._known.items() if n in job.around}
+        for n in job.around.keys() - self._known.keys():
+            self._known[n] = self._denoise(job.around[n])
+        mine = self._known[job.frame]
+        if isinstance(mine, SelfcorrectError):
+            raise mine
+        begun = time.perf_counter()
+        frames = {n: known.frame for n, known in self._known.items() if isinstance(known, Denoised)}
+        frame, history = self._histories.of(job.frame, frames)
+        reasons = {n: f"cannot be read ({why})" if why else "is not there" for n, why in job.missing.items()}
+        reasons |= {n: f"cannot be used ({why})" for n, why in self._known.items() if isinstance(why, SelfcorrectError)}
+        left_out = {n - job.frame: reason for n, reason in sorted(reasons.items())}
+        history = history._replace(left_out={**left_out, **history.left_out})
+        known = mine.facts.remembered(history, time.perf_counter() - begun)
+        return replace(mine, frame=frame, facts=known, began=began)
+
+    def _denoise(self, loaded: files.Loaded) -> "Denoised | SelfcorrectError":
+        try:
+            return self._runner.denoise(loaded, keep_aids=True)
+        except SelfcorrectError as error:
+            return error
 
 
 def _given(path: str, settings: Settings) -> Network:

@@ -10,15 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from selfcorrect.errors import MissingPackageError
 from selfcorrect.frame import Frame, mean
 from selfcorrect.image.bands import bands
 
-__all__ = ["Motion", "available", "between", "fetched", "optical_flow", "picture"]
+__all__ = ["Motion", "available", "between", "features", "fetched", "optical_flow", "picture", "warped"]
 
-_TOLERANCE = 1.5  # pixels that the way there and back may miss its start by
+_TOLERANCE = 1.5  # pixels that the flow forward and back may miss its start by
 _SHARES = (0.4, 0.2, 0.4)  # of albedo, normal and tone-mapped radiance in the picture that flow is found in
 _LIGHT = (0.5, 0.3, 0.2)  # a direction: shading by it turns normals into grey
 
@@ -40,26 +41,37 @@ def available() -> bool:
     return importlib.util.find_spec("cv2") is not None
 
 
+def features(frame: Frame) -> dict[str, Tensor]:
+    """Albedo and normal of both halves together, as far as there are, prefiltered where the frame knows them so."""
+    if frame.aids is not None:
+        known = {name: frame.aids[0].get(name) for name in ("albedo", "normal")}
+        return {name: image.float() for name, image in known.items() if image is not None}
+    pairs = {name: getattr(frame, name) for name in ("albedo", "normal")}
+    return {name: mean(pair) for name, pair in pairs.items() if pair is not None}
+
+
 def picture(frame: Frame) -> Tensor:
     """What flow is found in: (H, W) in 0 … 1 of albedo, normal and tone-mapped denoised radiance, as far as known.
 
-    Noise would be taken for motion, so the G-buffers are the mean of both halves and the radiance is denoised.
+    Noise would be taken for motion, so the G-buffers are of both halves and the radiance is denoised.
     """
-    full = frame.candidates[0].full
+    full, known = frame.candidates[0].full, features(frame)
     parts = [_SHARES[2] * (full / (1 + full)).mean(-1)]
     used = _SHARES[2]
-    if frame.albedo is not None:
-        parts.append(_SHARES[0] * mean(frame.albedo).clamp(0, 1).mean(-1))
+    if "albedo" in known:
+        parts.append(_SHARES[0] * known["albedo"].clamp(0, 1).mean(-1))
         used += _SHARES[0]
-    if frame.normal is not None:
+    if "normal" in known:
         light = torch.tensor(_LIGHT, device=full.device)
-        parts.append(_SHARES[1] * (mean(frame.normal).clamp(-1, 1) @ light + 1) / 2)
+        parts.append(_SHARES[1] * (known["normal"].clamp(-1, 1) @ light + 1) / 2)
         used += _SHARES[1]
     return (torch.stack(parts).sum(0) / used).clamp(0, 1)
 
 
 def optical_flow(image: Tensor, other: Tensor) -> Tensor:
     """Offsets (H, W, 2) from one picture (H, W) in 0 … 1 to another: dense inverse search (Kroeger et al. 2016).
+
+    A picture that the search finds too small for its patches has not moved.
 
     Raises:
         MissingPackageError: OpenCV is not installed.
@@ -68,6 +80,8 @@ def optical_flow(image: Tensor, other: Tensor) -> Tensor:
         cv2: Any = importlib.import_module("cv2")
     except ImportError as error:
         raise MissingPackageError("optical flow", "flow") from error
+    if min(image.shape) < _LEAST_SIDE:
+        return torch.zeros(*image.shape, 2, device=image.device)
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # with several, its sums may depend on their number
     try:
@@ -79,12 +93,22 @@ def optical_flow(image: Tensor, other: Tensor) -> Tensor:
     return flow.to(image.device)
 
 
-def between(image: Tensor, other: Tensor) -> Motion:
-    """Motion from one picture (see :func:`picture`) to another by optical flow, believed where the flow back agrees."""
-    there, back = optical_flow(image, other), optical_flow(other, image)
-    returned, inside = fetched(back, there)
-    missed = (there + returned).square().sum(-1)
-    return Motion(there, inside & (missed <= _TOLERANCE**2))
+_LEAST_SIDE = 16  # pixels: OpenCV's search fails below
+
+
+def between(image: Tensor, other: Tensor) -> tuple[Motion, Motion]:
+    """Motion from one picture (see :func:`picture`) to another and back, by optical flow.
+
+    Each is believed where the other leads back to where it began.
+    """
+    forward, backward = optical_flow(image, other), optical_flow(other, image)
+
+    def believed(there: Tensor, back: Tensor) -> Motion:
+        returned, inside = fetched(back, there)
+        missed = (there + returned).square().sum(-1)
+        return Motion(there, inside & (missed <= _TOLERANCE**2))
+
+    return believed(forward, backward), believed(backward, forward)
 
 
 def fetched(image: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,3 +127,21 @@ def fetched(image: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
         inside[rows] = (y >= 0) & (y < height) & (x >= 0) & (x < width)
         result[rows] = image[y.clamp(0, height - 1), x.clamp(0, width - 1)]
     return result, inside
+
+
+def warped(image: Tensor, offset: Tensor) -> Tensor:
+    """A denoised image of another frame, (H, W, C), between its pixels where offsets lead to, by cubic interpolation.
+
+    Its sharpness matters here, not its independence: the nearest pixel would shake edges by half a pixel.
+    """
+    height, width = offset.shape[:2]
+    size = torch.tensor([width, height], device=image.device)
+    result = torch.empty_like(image)
+    source = image.permute(2, 0, 1)[None]
+    columns = torch.arange(width, device=image.device)
+    for rows in bands(height):
+        y = torch.arange(rows.start, rows.stop, device=image.device)
+        place = torch.stack(torch.meshgrid(y, columns, indexing="ij")[::-1], -1) + offset[rows]
+        grid = (2 * place + 1) / size - 1
+        result[rows] = F.grid_sample(source, grid[None], "bicubic", "border", align_corners=False)[0].permute(1, 2, 0)
+    return result

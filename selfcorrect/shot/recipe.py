@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -11,10 +12,41 @@ from selfcorrect.errors import FileError
 from selfcorrect.exr import channels
 from selfcorrect.settings import Settings
 
-__all__ = ["recipe", "unlike"]
+__all__ = ["Digests", "recipe", "unlike"]
 
 
-def recipe(sources: files.Sources, settings: Settings, made_by: Mapping[str, Any], *, cold: bool = False) -> str:
+class Digests:
+    """Digests of files: those of the frames around are asked for again and again, and read once."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, int, int, int], str] = {}
+
+    def of(self, path: str) -> str:
+        """Of a file's bytes.
+
+        Raises:
+            FileError: it cannot be read.
+        """
+        try:
+            found = os.stat(path)
+            key = path, found.st_ino, found.st_size, found.st_mtime_ns
+            if key not in self._known:
+                with open(path, "rb") as stream:
+                    self._known[key] = hashlib.file_digest(stream, "blake2b").hexdigest()
+            return self._known[key]
+        except OSError as error:
+            raise FileError(f"{path}: expected an OpenEXR file, but got: {error.strerror}") from None
+
+
+def recipe(
+    sources: files.Sources,
+    settings: Settings,
+    made_by: Mapping[str, Any],
+    *,
+    cold: bool = False,
+    around: Sequence[files.Sources] = (),
+    digests: Digests | None = None,
+) -> str:
     """What an output is made by: version, settings, denoiser, layers, and the bytes of every input.
 
     Where the chain began is no part of it: the same frame may start cold in one chunk and warm in another.
@@ -24,15 +56,15 @@ def recipe(sources: files.Sources, settings: Settings, made_by: Mapping[str, Any
         settings: of the correction; the files they name are inputs, too.
         made_by: what else decides the output, such as the denoiser's name; plain values.
         cold: no frame starts from the one before.
+        around: the neighbours, whose files need not be there.
+        digests: those that are known already.
 
     Raises:
         FileError: an input cannot be read.
     """
+    digests = Digests() if digests is None else digests
     parts = [path.partition("::") for path in sources.inputs if path]
-    beside = [
-        str(path) for half in (sources.a, sources.b) for path in channels.siblings(half.partition("::")[0]).values()
-    ]
-    contents = [_digest(path) for path in (*(path for path, _, _ in parts), *sorted(beside), *settings.files)]
+    contents = [digests.of(path) for path in (*_files(sources), *settings.files)]
     how = {
         "version": version("selfcorrect"),
         "settings": settings.to_dict(),
@@ -42,6 +74,7 @@ def recipe(sources: files.Sources, settings: Settings, made_by: Mapping[str, Any
         "given": [bool(path) for path in sources.inputs],
         "mapping": dict(sources.mapping or {}),
         "contents": contents,
+        "around": [_there(neighbour, digests) for neighbour in around],
     }
     return hashlib.blake2b(json.dumps(how, sort_keys=True).encode(), digest_size=16).hexdigest()
 
@@ -63,9 +96,18 @@ def unlike(output: str, made: str) -> str:
     return ""
 
 
-def _digest(path: str) -> str:
+def _files(sources: files.Sources) -> list[str]:
+    """The frame's own and those that lie beside its halves."""
+    own = [path.partition("::")[0] for path in sources.paths]
+    beside = [
+        str(path) for half in (sources.a, sources.b) for path in channels.siblings(half.partition("::")[0]).values()
+    ]
+    return own + sorted(beside)
+
+
+def _there(sources: files.Sources, digests: Digests) -> list[str] | None:
+    """What a neighbour's files hold; None where one of them cannot be read."""
     try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "blake2b").hexdigest()
-    except OSError as error:
-        raise FileError(f"{path}: expected an OpenEXR file, but got: {error.strerror}") from None
+        return [digests.of(path) for path in _files(sources)]
+    except FileError:
+        return None

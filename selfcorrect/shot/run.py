@@ -20,7 +20,7 @@ from selfcorrect.publish import remove_abandoned
 from selfcorrect.settings import Settings
 from selfcorrect.shot.chain import Chain, Link
 from selfcorrect.shot.framerange import fill, has_frame
-from selfcorrect.shot.recipe import recipe, unlike
+from selfcorrect.shot.recipe import Digests, recipe, unlike
 from selfcorrect.shot.state import State, check_state_target, save_state, state_after
 from selfcorrect.stages.core.network import Network
 
@@ -88,6 +88,7 @@ class Options:
             (:mod:`selfcorrect.shot.chain` has the rule).
         save_state: file to keep the network in after every frame; with a place for the frame number, one for each.
         fail_fast: end with the first frame that fails.
+        reach: how many frames on either side the work on a frame looks at, also those beyond ``Shot.frames``.
     """
 
     settings: Settings
@@ -97,6 +98,7 @@ class Options:
     warm_start: Network | None = None
     save_state: str | None = None
     fail_fast: bool = False
+    reach: int = 0
 
 
 class Job(NamedTuple):
@@ -109,6 +111,9 @@ class Job(NamedTuple):
         recipe: to be stored in the output.
         link: what it takes from the frames before.
         meanwhile: to be called now and then during the work; reports the last frame once it is written.
+        around: what was read of the frames within reach, by number, the frame itself among them; the same objects from
+            job to job.
+        missing: why others within reach could not be read; empty of one whose files are not there.
     """
 
     frame: int
@@ -117,6 +122,8 @@ class Job(NamedTuple):
     recipe: str
     link: Link
     meanwhile: Callable[[], None]
+    around: Mapping[int, files.Loaded]
+    missing: Mapping[int, str]
 
 
 class Done(NamedTuple):
@@ -149,7 +156,7 @@ class Outcome(NamedTuple):
 
 class _Fetched(NamedTuple):
     recipe: str
-    loaded: files.Loaded | None  # None: the output is there
+    read: dict[int, files.Loaded | Exception] | None  # what was not within reach before; None: the output is there
 
 
 def run(
@@ -161,8 +168,8 @@ def run(
 ) -> int:
     """Work through a shot.
 
-    While a frame is being computed, the next one is read and the last one written, a thread each; three frames are in
-    memory at most.
+    While a frame is being computed, what the next one needs is read and the last one written, a thread each; three
+    frames are in memory at most, and twice the reach.
 
     Args:
         shot: the files.
@@ -195,6 +202,9 @@ class _Run:
         self._writing: deque[tuple[int, Future[Any]]] = deque()
         self._chain = Chain(options.warm_start, cold=options.cold)
         self._skipped: tuple[int, str] | None = None  # the predecessor and its recipe, where it was skipped
+        self._around: dict[int, files.Loaded | Exception] = {}  # what is within reach
+        self._read: set[int] = set()  # the numbers in it once the reader's last frame is worked on; the reader's own
+        self._digests = Digests()  # the reader's own
 
     def all(self) -> int:
         self._check()
@@ -241,34 +251,71 @@ class _Run:
     def _fetch(self, frame: int) -> _Fetched:
         """In the reader's thread."""
         sources, output = self.shot.sources(frame), self.shot.target(frame)
-        made = recipe(sources, self.options.settings, self.options.made_by, cold=self.options.cold)
+        around = [n for distance in range(1, self.options.reach + 1) for n in (frame - distance, frame + distance)]
+        around = [n for n in around if n >= 0]
+        made = recipe(
+            sources,
+            self.options.settings,
+            self.options.made_by,
+            cold=self.options.cold,
+            around=[*map(self.shot.sources, around)],
+            digests=self._digests,
+        )
         if self.options.skip_existing and Path(output).exists():
             reason = unlike(output, made)
             if not reason:
                 return _Fetched(made, None)
             self.note(f"frame {frame}: {reason}; it is made again")
         exr.check_target(output)
-        return _Fetched(made, files.load(sources))
+        read = {n: self._load(n) for n in (frame, *around) if n not in self._read}
+        self._read = {frame, *around}
+        return _Fetched(made, read)
+
+    def _load(self, frame: int) -> files.Loaded | Exception:
+        """In the reader's thread. What is wrong with a file is for the frames that need it to tell."""
+        try:
+            return files.load(self.shot.sources(frame))
+        except Exception as error:
+            return error
 
     def _one(self, frame: int, fetched: _Fetched, writer: ThreadPoolExecutor) -> None:
         output = self.shot.target(frame)
-        if fetched.loaded is None:
+        if fetched.read is None:
             self._skipped = frame, fetched.recipe
             self._flush()
             self._report(Outcome(frame, output, "skipped"))
             return
-        link = self._link(fetched.loaded)
-        for note in link.notes:
-            self.note(f"frame {frame}: {note}")
-        job = Job(frame, output, fetched.loaded, fetched.recipe, link, lambda: self._flush(wait=False))
+        self._around = {n: r for n, r in self._around.items() if abs(n - frame) <= self.options.reach} | fetched.read
+        fetched.read.clear()
+        loaded = self._around[frame]
+        if isinstance(loaded, Exception):
+            self._fail(frame, loaded)
+            return
+        if not self.options.reach:
+            self._around.clear()  # nothing holds the frame longer than the work on it
         try:
-            done = self.work(job)
+            done = self.work(self._job(frame, output, loaded, fetched.recipe))
         except Exception as error:
             self._fail(frame, error)
             return
         self._chain.corrected(done.network)
         self._flush()
         self._writing.append((frame, writer.submit(self._write, frame, fetched.recipe, done)))
+
+    def _job(self, frame: int, output: str, loaded: files.Loaded, made: str) -> Job:
+        link = self._link(loaded)
+        for note in link.notes:
+            self.note(f"frame {frame}: {note}")
+        around = {n: read for n, read in self._around.items() if isinstance(read, files.Loaded)}
+        missing = {
+            n: self._reason(n, read) if self._exists(n) else ""
+            for n, read in self._around.items()
+            if isinstance(read, Exception)
+        }
+        return Job(frame, output, loaded, made, link, lambda: self._flush(wait=False), around, missing)
+
+    def _exists(self, frame: int) -> bool:
+        return any(os.path.exists(path.partition("::")[0]) for path in self.shot.sources(frame).paths)
 
     def _link(self, loaded: files.Loaded) -> Link:
         """What a frame takes from those before it."""

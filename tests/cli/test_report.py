@@ -86,10 +86,10 @@ def test_page_of_a_shot(shot_folder: Path) -> None:
 
 def test_page_of_a_shot_that_goes_on(shot_folder: Path) -> None:
     """Frames that were there are told from their files, and one that cannot be read is told as failed."""
-    assert cli.main(arguments(shot_folder, last=3)) == 0
+    assert cli.main(arguments(shot_folder, "--frame-radius", 0, last=3)) == 0
     (shot_folder / "b.0005.exr").unlink()
     page = shot_folder / "shot.html"
-    assert cli.main(arguments(shot_folder, "--skip-existing", "--report", page)) == 1
+    assert cli.main(arguments(shot_folder, "--frame-radius", 0, "--skip-existing", "--report", page)) == 1
     frames = data_of(page.read_text())["frames"]
     assert [frame["outcome"] for frame in frames] == ["skipped"] * 3 + ["written", "failed"]
     assert [frame["change"] is not None for frame in frames] == [True] * 4 + [False]

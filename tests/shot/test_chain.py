@@ -133,7 +133,7 @@ class TestApiAndCommand:
     def of_api(self, folder: Path, numbers: list[int], **how: Any) -> list[tuple[np.ndarray[Any, Any], Any]]:
         box = denoisers.create("box", threads=1)
         read = (files.load(files.Sources(*(str(folder / f"{h}.{n:04d}.exr") for h in "ab"))).frame for n in numbers)
-        results = correct_sequence((frame.denoise(box) for frame in read), settings_of(FAST), **how)
+        results = correct_sequence((frame.denoise(box) for frame in read), settings_of(FAST), denoiser=box, **how)
         return [(result.image.half().numpy(), result.start._asdict()) for result in results]
 
     @pytest.mark.parametrize("cold", [False, True])

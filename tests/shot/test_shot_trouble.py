@@ -35,7 +35,17 @@ def test_a_truncated_or_missing_frame_is_reported_and_the_rest_go_on(shot_folder
     write_half(shot_folder / "b.0004.exr", 41)
     code, _, frames = sequence(arguments(shot_folder, "--skip-existing"))
     assert code == 0
-    assert [f["outcome"] for f in frames] == ["skipped", "written", "skipped", "written", "skipped"]
+    assert [f["outcome"] for f in frames] == ["written"] * LAST  # what had been left out is a neighbour of all
+
+
+def test_without_history_a_frame_that_comes_late_changes_no_other(shot_folder: Path, sequence: Run) -> None:
+    whole = (shot_folder / "a.0002.exr").read_bytes()
+    (shot_folder / "a.0002.exr").write_bytes(whole[: len(whole) // 2])
+    assert sequence(arguments(shot_folder, "--frame-radius", 0))[0] == 1
+    (shot_folder / "a.0002.exr").write_bytes(whole)
+    code, _, frames = sequence(arguments(shot_folder, "--frame-radius", 0, "--skip-existing"))
+    assert code == 0
+    assert [f["outcome"] for f in frames] == ["skipped", "written", "skipped", "skipped", "skipped"]
 
 
 def test_fail_fast_ends_with_the_first_failure(shot_folder: Path, sequence: Run) -> None:
