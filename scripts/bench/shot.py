@@ -5,8 +5,8 @@
 Variants: ``cold`` (each frame on its own), ``warm`` (each from the last one's network, with the preset's settings for
 that), ``key`` (each from the first frame's network), ``history`` (warm, with the samples of the neighbours that are in
 the folder; ``candidate`` is its image before any guard), and any of them with settings changed:
-``warm:warm_steps=50``, commas between several; ``history:frame_radius=1`` takes fewer neighbours. Prints relMSE of noisy, denoised and each variant for every frame, with the mean radiance over
-that of the smooth reference, the mean over the frames after the first (which is cold in any case), and the temporal
+``warm:warm_steps=50``, commas between several; ``history:frame_radius=1`` takes fewer neighbours. Prints relMSE of
+noisy, denoised and each variant for every frame, with the mean radiance over that of the smooth reference, the mean over the frames after the first (which is cold in any case), and the temporal
 error (:func:`selfcorrect.metrics.temporal_error`), the mean over all pairs of neighbours.
 """
 
@@ -45,11 +45,10 @@ def corrected(frames: list[Frame], preset: str, variant: str, denoiser: Any) -> 
     settings = Settings.preset(preset, **{k: int(v) if v.isdigit() else float(v) for k, v in pairs.items()})
     images, seconds, last, first = [], [], None, None
     histories = Histories(settings.frame_radius if how in ("history", "candidate") else 0, denoiser)
-    for number, frame in enumerate(frames):
-        start = time.process_time()
+    for number, given in enumerate(frames):
+        start, frame = time.process_time(), given
         if histories.reach:
-            around = {n: f for n, f in enumerate(frames) if abs(n - number) <= histories.reach}
-            frame, _ = histories.of(number, around)
+            frame, _ = histories.of(number, {n: f for n, f in enumerate(frames) if abs(n - number) <= histories.reach})
         if how == "candidate":
             images.append(frame.candidates[-1].full)
             seconds.append(time.process_time() - start)

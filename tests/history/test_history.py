@@ -103,7 +103,10 @@ def test_the_same_noise_in_the_other_half_is_seen() -> None:
 def test_without_a_denoiser_the_denoised_images_are_averaged() -> None:
     here, truth = frame(2, noise=0.1)
     neighbours = {distance: frame(2 + distance, noise=0.1)[0] for distance in (-2, -1, 1, 2)}
-    as_they_are = {distance: f.with_denoised(f.color) for distance, f in {0: here, **neighbours}.items()}
+    as_they_are = {
+        distance: f.with_denoised(f.color, (f.color[0] + f.color[1]) / 2)
+        for distance, f in {0: here, **neighbours}.items()
+    }
     found, history = with_history(as_they_are.pop(0), as_they_are)
     assert list(history.found) == [-2, -1, 1, 2]
     assert error(found.more[0].full, truth) < 0.6 * error((here.color[0] + here.color[1]) / 2, truth)
