@@ -6,8 +6,10 @@ Variants: ``cold`` (each frame on its own), ``warm`` (each from the last one's n
 that), ``key`` (each from the first frame's network), ``history`` (warm, with the samples of the neighbours that are in
 the folder; ``candidate`` is its image before any guard), and any of them with settings changed:
 ``warm:warm_steps=50``, commas between several; ``history:frame_radius=1`` takes fewer neighbours. Prints relMSE of
-noisy, denoised and each variant for every frame, with the mean radiance over that of the smooth reference, the mean over the frames after the first (which is cold in any case), and the temporal
-error (:func:`selfcorrect.metrics.temporal_error`), the mean over all pairs of neighbours.
+noisy, denoised and each variant for every frame, with the mean radiance over that of the smooth reference, the mean
+over the frames after the first (which is cold in any case), and the temporal error
+(:func:`selfcorrect.metrics.temporal_error`), the mean over all pairs of neighbours; and each as a share of the
+denoised image's.
 """
 
 import argparse
