@@ -1,0 +1,140 @@
+"""What tempts a temporal denoiser to ghost: behind the guard, no frame gets worse than its denoised image."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from selfcorrect import Frame, Settings, correct
+from selfcorrect.history import Histories
+
+SIZE = (64, 96)
+HERE = 2  # of frames 0 … 4
+SETTINGS = Settings.preset("balanced", steps=2, window=5, patch=32, batch=2, candidates="none", precision="fp32")
+Truth = tuple[Tensor, Tensor]  # radiance and albedo, (H, W, 3) each
+Scene = Callable[[int], Truth]
+
+
+def texture(seed: int = 0, width: int = 160) -> Tensor:
+    """Smooth blobs of all sizes, (H, width, 3) in 0.1 … 1."""
+    generator = torch.Generator().manual_seed(seed)
+    total = torch.zeros(1, 3, SIZE[0], width)
+    for cells in (4, 8, 16):
+        noise = torch.rand(1, 3, cells, 2 * cells, generator=generator)
+        total += torch.nn.functional.interpolate(noise, size=(SIZE[0], width), mode="bicubic")
+    image = total[0].permute(1, 2, 0)
+    return 0.1 + 0.9 * (image - image.min()) / (image.max() - image.min())
+
+
+def window(image: Tensor, left: int) -> Tensor:
+    return image[:, left : left + SIZE[1]].clone()
+
+
+def light_switches(number: int) -> Truth:
+    """A lamp goes on between the frame before and this one."""
+    albedo = window(texture(), 30)
+    return albedo * (1.0 if number >= HERE else 0.3), albedo
+
+
+def shadow_moves(number: int) -> Truth:
+    albedo = window(texture(), 30)
+    light = torch.ones(*SIZE, 1)
+    light[20:44, 10 + 14 * number : 26 + 14 * number] = 0.35
+    return albedo * light, albedo
+
+
+def mirror(number: int) -> Truth:
+    """The surface stands still; what it shows moves by five pixels a frame."""
+    albedo = torch.full((*SIZE, 3), 0.9)
+    albedo[:8] = window(texture(), 30)[:8]  # the frame of the mirror
+    radiance = albedo.clone()
+    radiance[8:] = window(texture(1), 5 + 5 * number)[8:]
+    return radiance, albedo
+
+
+def texture_moves(number: int) -> Truth:
+    """On still geometry, in emitted light that no G-buffer knows."""
+    albedo = window(texture(), 30)
+    return albedo * (0.3 + window(texture(2), 5 + 9 * number)), albedo
+
+
+def disocclusion(number: int) -> Truth:
+    """A dark pillar moves fast in front of a wall."""
+    albedo = window(texture(), 30)
+    albedo[:, 5 + 17 * number : 23 + 17 * number] = 0.08
+    return albedo, albedo
+
+
+def cut(number: int) -> Truth:
+    albedo = window(texture(0 if number >= HERE else 3), 30)
+    return albedo, albedo
+
+
+def sky_changes(number: int) -> Truth:
+    """A still camera; clouds drift over the upper half, which has no albedo."""
+    albedo, radiance = window(texture(), 30), window(texture(), 30)
+    albedo[:32] = 0
+    radiance[:32] = 2 * window(texture(4), 3 + 11 * number)[:32]
+    return radiance, albedo
+
+
+def still(number: int) -> Truth:
+    albedo = window(texture(), 30)
+    return albedo, albedo
+
+
+def pan(number: int) -> Truth:
+    albedo = window(texture(), 30 + 3 * number)
+    return albedo, albedo
+
+
+SCENES = (light_switches, shadow_moves, mirror, texture_moves, disocclusion, cut, sky_changes)
+
+
+def demodulated(color: Tensor, albedo: Tensor, normal: Tensor | None = None) -> Tensor:
+    """A denoiser that leaves noise rather than take detail: the light on a surface is averaged over 5×5 pixels."""
+    light = (color / (albedo + 0.05)).permute(2, 0, 1)[None]
+    padded = torch.nn.functional.pad(light, (2, 2, 2, 2), "replicate")
+    return torch.nn.functional.avg_pool2d(padded, 5, 1)[0].permute(1, 2, 0) * (albedo + 0.05)
+
+
+def frame(scene: Scene, number: int, noise: float = 0.6) -> Frame:
+    radiance, albedo = scene(number)
+    generator = torch.Generator().manual_seed(100 + number)
+    halves = tuple(radiance * (1 + noise * torch.randn(*SIZE, 3, generator=generator)) for _ in "ab")
+    noisy = tuple((albedo + 0.02 * torch.randn(*SIZE, 3, generator=generator)).clamp(0, 1) for _ in "ab")
+    return Frame(color=halves, albedo=noisy).denoise(demodulated)
+
+
+def errors(scene: Scene, frames: Mapping[int, Frame]) -> tuple[float, float, float]:
+    """Relative squared error of the denoised image, of the candidate, and of the output."""
+    truth, _ = scene(HERE)
+    remembered, _ = Histories(2, demodulated).of(HERE, frames)
+    output = correct(remembered, SETTINGS).image
+
+    def of(image: Any) -> float:
+        return float(((image - truth) ** 2 / (truth.mean(-1, keepdim=True) ** 2 + 0.01)).mean())
+
+    return of(frames[HERE].denoised_full), of(remembered.candidates[-1].full), of(output)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_no_frame_gets_worse(scene: Scene) -> None:
+    denoised, _, output = errors(scene, {n: frame(scene, n) for n in range(5)})
+    assert output <= 1.01 * denoised
+
+
+@pytest.mark.parametrize("scene", [still, pan])
+def test_and_what_can_be_gained_is(scene: Scene) -> None:
+    """Else the guard could pass the others by taking nothing."""
+    denoised, candidate, output = errors(scene, {n: frame(scene, n) for n in range(5)})
+    assert candidate < 0.6 * denoised
+    assert output < 0.7 * denoised
+
+
+def test_frames_in_the_wrong_order_do_no_harm() -> None:
+    frames = {n: frame(pan, n) for n in range(5)}
+    denoised, _, output = errors(pan, {0: frames[3], 1: frames[4], HERE: frames[HERE], 3: frames[0], 4: frames[1]})
+    assert output <= 1.01 * denoised
