@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 from selfcorrect import exr, metrics
+from selfcorrect.cli.compare_shot import compare_shot
 from selfcorrect.cli.terminal import answer
 from selfcorrect.errors import FrameError
 
@@ -19,11 +20,19 @@ def add(commands: Any) -> None:
     parser.add_argument("reference_b", metavar="REF2.exr", nargs="?", help="an independent second reference")
     parser.add_argument("--weight", metavar="SMOOTH.exr", help="smooth reference for the weight of relMSE")
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
+    parser.add_argument(
+        "--shot",
+        action="store_true",
+        help="names hold #### for the frame number: errors of every frame and of the change from frame to frame",
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.set_defaults(run=_compare)
 
 
 def _compare(options: argparse.Namespace) -> None:
+    if options.shot:
+        compare_shot(options)
+        return
     image, reference = (exr.load_half(path).buffers["color"] for path in (options.image, options.reference))
     reference_b, weight = (
         None if path is None else exr.load_half(path).buffers["color"] for path in (options.reference_b, options.weight)

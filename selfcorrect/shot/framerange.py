@@ -5,7 +5,7 @@ from pathlib import Path
 
 from selfcorrect.errors import SettingsError
 
-__all__ = ["fill", "has_frame", "parse_frames"]
+__all__ = ["fill", "has_frame", "parse_frames", "there"]
 
 _RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?:[x:](\d+))?)?")
 _MOST = 1_000_000  # frames; a slip such as 1-10000000 must not fill the memory
@@ -65,6 +65,18 @@ def fill(pattern: str, frame: int) -> str:
     text = place[0]
     number = f"{frame:0{len(text)}d}" if text.startswith("#") else text % frame
     return pattern[: place.start()] + number + pattern[place.end() :]
+
+
+def there(pattern: str) -> list[int]:
+    """The numbers of the frames whose files are there, ascending.
+
+    Raises:
+        SettingsError: the name has no place for the number.
+    """
+    fill(pattern, 0)
+    path = Path(pattern.partition("::")[0])
+    numbers = {int(digits) for other in path.parent.glob("*") for digits in re.findall(r"-?\d+", other.name)}
+    return sorted(n for n in numbers if Path(fill(pattern, n).partition("::")[0]).is_file())
 
 
 def _place(pattern: str) -> re.Match[str] | None:
