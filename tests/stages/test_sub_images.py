@@ -2,14 +2,16 @@
 
 import pytest
 import torch
-from helpers.trained import make_both
+from helpers.trained import make_both, settings, state_of
 
 import denoisers
-from selfcorrect import Frame, Settings
+from selfcorrect import Frame, Settings, correct
 from selfcorrect.cli import memory
 from selfcorrect.errors import FrameError
 from selfcorrect.files import Sources
-from selfcorrect.stages.deep_combiner_4 import SubImages
+from selfcorrect.stages.deep_combiner_4 import DeepCombiner4, SubImages
+from selfcorrect.stages.images import StageImages
+from selfcorrect.stages.stage import Outcome, Work
 
 
 def test_sub_images_are_checked() -> None:
@@ -57,3 +59,23 @@ def test_sub_images_count_as_memory(renders: list[str]) -> None:
     image = 64 * 70 * 12  # bytes
     grown = [one - other for one, other in zip(with_them, without, strict=True)]
     assert grown == [4 * image, 8 * image, 8 * image, 0]
+
+
+def test_sub_images_move_with_the_frame(weight_files: dict[str, str]) -> None:
+    """A frame elsewhere takes them along, whoever holds them; those that were given stay where they are."""
+    frame, subs = make_both()
+    chosen = settings(weight_files, stages="deep-combiner-4", input_scale=1.0)
+    seen: list[SubImages] = []
+
+    class Watched(DeepCombiner4):
+        def run(self, state: StageImages, work: Work) -> Outcome:
+            seen.append(work.extra)
+            outcome = super().run(state, work)
+            assert outcome.state.full.device.type == "meta"
+            return Outcome(state_of(frame))
+
+    correct(frame.to("meta"), chosen, opened=[Watched(chosen)], extra={"deep-combiner-4": subs})
+    (moved,) = seen
+    assert moved.denoised is not None
+    assert {image.device.type for image in (*moved.images, *moved.denoised)} == {"meta"}
+    assert {image.device.type for image in (*subs.images, *(subs.denoised or ()))} == {"cpu"}
