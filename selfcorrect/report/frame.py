@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcorrect.report import words
+from selfcorrect import words
 from selfcorrect.report.html import assembled, facts_sections, section
 from selfcorrect.report.pack import LARGEST_PAGE, Packed, fitted, reduced
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from helpers.pages import ESTIMATE, FACTS, data_of, images, maps, unpacked
 
-from selfcorrect import report
-from selfcorrect.report import words
+from selfcorrect import report, words
 from selfcorrect.report.pack import pack, reduced
 from selfcorrect.settings import Settings
 

@@ -100,7 +100,7 @@ def test_other_weights_are_another_recipe(renders: list[str], weight_files: dict
 
 def test_help_names_the_weights(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        cli.main(["frame", "--help"])
+        cli.main(["frame", "--help-all"])
     assert ended.value.code == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "--sub-images A1.exr A2.exr B1.exr B2.exr" in told
