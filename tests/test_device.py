@@ -144,7 +144,7 @@ def test_without_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel, "import_module", missing)
     guides = guides_of(make_frame().halves[0], 2)
     raw = torch.zeros(1, kernel.heads_count(guides, "eq10"), 4, 4)
-    with pytest.raises(MissingPackageError, match=r"pip install 'selfcorrect\[gpu\]'"):
+    with pytest.raises(MissingPackageError, match=r"pip install 'triton>="):
         kernel.cross_bilateral(guides, raw, torch.zeros(1, 2, dtype=torch.int64), kernel.Window(3), backend="gpu")
 
 

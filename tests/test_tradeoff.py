@@ -195,7 +195,7 @@ class TestTelling:
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-        with pytest.raises(MissingPackageError, match=r"pip install 'selfcorrect\[bench\]'"):
+        with pytest.raises(MissingPackageError, match=r"pip install 'matplotlib>="):
             tradeoff.plot([measurement(1, 1)], "error")
         halves = [str(write_half(tmp_path / f"{i}.exr", i)) for i in range(2)]
         picture = tmp_path / "out.png"
