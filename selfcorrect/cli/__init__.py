@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from selfcorrect.cli import bench, combine, compare, demo, frame, inspect, report, sequence, settings
+from selfcorrect.cli import bench, combine, compare, completion, demo, frame, inspect, report, sequence, settings
 from selfcorrect.cli.help import Parser
 from selfcorrect.cli.terminal import log
 from selfcorrect.errors import SelfcorrectError, out_of_memory
@@ -11,7 +11,7 @@ from selfcorrect.exr.file import one_line
 
 __all__ = ["main"]
 
-_COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, settings, demo)
+_COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, settings, demo, completion)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

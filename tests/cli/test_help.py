@@ -1,6 +1,7 @@
 """Short help, all of it, settings by name and from files, and the version."""
 
 import json
+import subprocess
 from collections.abc import Iterator
 from dataclasses import fields
 from importlib.metadata import version
@@ -12,7 +13,7 @@ from helpers.commands import call, refused
 from selfcorrect import Settings, cli
 from selfcorrect.cli.help import Expert
 
-COMMANDS = ("frame", "sequence", "bench", "inspect", "compare", "report", "combine", "settings", "demo")
+COMMANDS = ("frame", "sequence", "bench", "inspect", "compare", "report", "combine", "settings", "demo", "completion")
 RUNS = ("frame", "sequence", "bench", "demo")
 
 
@@ -158,3 +159,23 @@ def test_a_file_of_settings_that_does_not_fit_is_named(text: bytes | None, messa
         file.write_bytes(text)
     line = refused("settings", "--settings", file)
     assert f"own.toml: {message}" in line or ("own.toml: " in line and message in line)
+
+
+def completed(line: str) -> list[str]:
+    """What bash offers at the end of a line."""
+    script = call("completion", "bash").stdout
+    words = line.split(" ")
+    ask = f'COMP_WORDS=("$@") COMP_CWORD={len(words) - 1}; _selfcorrect; printf "%s\\n" "${{COMPREPLY[@]}}"'
+    command = ["bash", "-c", f"{script}\n{ask}", "bash", *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_the_shell_completes() -> None:
+    assert completed("selfcorrect fr") == ["frame"]
+    assert completed("selfcorrect ") == [*COMMANDS]
+    assert completed("selfcorrect frame a.exr b.exr --denoised-") == ["--denoised-a", "--denoised-b"]
+    assert completed("selfcorrect frame --preset ") == list(Settings.presets())
+    assert "oidn:fast" in completed("selfcorrect frame --denoiser oidn")
+    assert completed("selfcorrect frame a") == []
+    assert completed("selfcorrect inspect --j") == ["--json"]
+    assert call("completion", "zsh").stdout.startswith("autoload")
