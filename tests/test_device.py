@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.tolerances import INTERPRETED_LOSS, near
 from torch import Tensor
 
 from selfcorrect import Frame, Settings, cli, correct
@@ -108,8 +109,8 @@ def test_a_whole_frame_through_the_interpreter(monkeypatch: pytest.MonkeyPatch) 
     compiled = correct(frame, settings)
     monkeypatch.setattr(kernel, "choose", lambda *_, **__: "gpu")
     interpreted = correct(frame, settings)
-    torch.testing.assert_close(interpreted.image, compiled.image, rtol=1e-5, atol=1e-6)
-    assert interpreted.losses == pytest.approx(compiled.losses, rel=1e-5)
+    torch.testing.assert_close(interpreted.image, compiled.image, **near("whole frame interpreted"))
+    assert interpreted.losses == pytest.approx(compiled.losses, rel=INTERPRETED_LOSS)
 
 
 def test_where_no_value_fits(monkeypatch: pytest.MonkeyPatch) -> None:

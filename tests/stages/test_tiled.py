@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.tolerances import near
 from helpers.trained import SIZE, SMALL, make_both, make_frame, planes, wild
 from torch import Tensor
 
@@ -50,6 +51,6 @@ def test_tiles_of_single_precision_are_those_of_the_network() -> None:
         )
         combined = four(noisy, denoised, features[None])
     got = blend_whole(network, x, variance, *frame.denoised, side=16)
-    torch.testing.assert_close(planes(got), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(planes(got), expected, **near("neural blend in tiles"))
     got = combine_whole(four, subs.images, subs.denoised, features, side=16)
-    torch.testing.assert_close(planes(got), combined, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(planes(got), combined, **near("combiner in tiles"))

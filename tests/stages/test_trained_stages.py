@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.tolerances import near
 from helpers.trained import make_both, make_frame, planes, settings, state_of
 from helpers.witness import share_of_witness
 
@@ -30,7 +31,7 @@ def test_exposure_changes_nothing(stages: str, features: bool, weight_files: dic
     (frame, subs), (bright, bright_subs) = (make_both(features=features, scale=scale) for scale in (1.0, 1000.0))
     plain = correct(frame, chosen, extra={"deep-combiner-4": subs}).image
     brighter = correct(bright, chosen, extra={"deep-combiner-4": bright_subs}).image
-    torch.testing.assert_close(brighter / 1000, plain, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(brighter / 1000, plain, **near("trained and exposure"))
     assert not torch.allclose(plain, frame.denoised_full, atol=1e-3)
 
 
@@ -85,9 +86,9 @@ def test_neural_james_stein_by_hand(weight_files: dict[str, str]) -> None:
     beyond = frame.denoised_full + 0.1 - mean(frame.denoised)
     x, variance = mean(frame.color), variance_of_mean(frame.color).float()
     given = [planes(image) for image in (x, variance, *(image + beyond for image in frame.denoised))]
-    torch.testing.assert_close(planes(got.full), neural_blend(*network(*given), *given), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(planes(got.full), neural_blend(*network(*given), *given), **near("neural by hand"))
     own = [planes(image) for image in (frame.color[1], 2 * variance, frame.denoised[1], frame.denoised[1])]
-    torch.testing.assert_close(planes(got.images[1]), neural_blend(*network(*own), *own), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(planes(got.images[1]), neural_blend(*network(*own), *own), **near("neural by hand"))
 
 
 def test_flat_weights_are_the_classical_stage(tmp_path: Path) -> None:
@@ -107,7 +108,7 @@ def test_flat_weights_are_the_classical_stage(tmp_path: Path) -> None:
         torch.nn.functional.pad(planes(q * variance), (7, 7, 7, 7), mode="reflect"), 15, stride=1
     )
     expected = james_stein(x, state.full, smoothed[0].permute(1, 2, 0) / q, q, sigma=0)
-    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got, expected, **near("neural blend, flat"))
 
 
 def test_g_buffers_as_the_combiner_sees_them() -> None:
