@@ -20,7 +20,7 @@ from selfcorrect.stages.core.infer import SIDE
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.train import Progress
 from selfcorrect.stages.images import StageImages
-from selfcorrect.stages.stage import Stage, Start, Work
+from selfcorrect.stages.stage import Images, Stage, Start, Work
 
 __all__ = ["COLOR_OUTPUT", "Result", "Start", "correct"]
 
@@ -90,7 +90,7 @@ def correct(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
     opened: Sequence[Stage] | None = None,
-    extra: Mapping[str, Any] | None = None,
+    extra: Mapping[str, Images] | None = None,
 ) -> Result:
     """Correct a denoised frame (Back et al. 2022).
 
@@ -105,7 +105,7 @@ def correct(
         opened: the settings' stages, to spare a shot from reading their weights for every frame
             (:func:`selfcorrect.stages.opened`).
         extra: by name of a stage, what it needs beyond the halves, such as the
-            :class:`selfcorrect.stages.deep_combiner_4.SubImages` of deep-combiner-4.
+            :class:`selfcorrect.stages.deep_combiner_4.SubImages` of deep-combiner-4, on any device.
 
     Returns:
         The corrected image and the network. The same seed gives the same bits on the same machine and number of
@@ -132,11 +132,12 @@ def correct(
     state, learned, seconds = first, None, dict[str, float]()
     for stage in opened:
         begun = time.perf_counter()
+        beyond = (extra or {}).get(stage.name)
         work = Work(
             warm_start=warm_start if stage.learns else None,
             progress=progress,
             stop=stop,
-            extra=(extra or {}).get(stage.name),
+            extra=None if beyond is None else beyond.to(first.full.device),
             keep=judge.keep if judge is not None and stage is opened[-1] else None,
         )
         state, just_learned, parts = stage.run(state, work)

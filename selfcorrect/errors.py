@@ -16,6 +16,7 @@ A message is one line: «expected X, but got Y», with the file and the channel 
 
 import re
 import unicodedata
+from importlib.metadata import requires
 
 __all__ = [
     "ChannelError",
@@ -27,6 +28,7 @@ __all__ = [
     "SelfcorrectError",
     "SettingsError",
     "out_of_memory",
+    "packages_of",
     "printable",
 ]
 
@@ -36,6 +38,12 @@ _NO_MEMORY = re.compile("allocate memory|out of memory|bad_alloc", re.IGNORECASE
 def out_of_memory(error: BaseException) -> bool:
     """Whether an exception says that there was no memory left: Python's, NumPy's, or one of torch's allocators."""
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and bool(_NO_MEMORY.search(str(error))))
+
+
+def packages_of(extra: str) -> list[str]:
+    """The packages of one of the project's extras, as pip takes them: that works wherever selfcorrect came from."""
+    lines = [line.partition(";") for line in requires("selfcorrect") or ()]
+    return [package.strip() for package, _, marker in lines if re.search(rf"""extra == ['"]{extra}['"]""", marker)]
 
 
 def printable(text: str) -> str:
@@ -87,4 +95,5 @@ class MissingPackageError(SelfcorrectError):
     """An optional package is not installed."""
 
     def __init__(self, purpose: str, extra: str):
-        super().__init__(f"{purpose} needs a package that is not installed; run: pip install 'selfcorrect[{extra}]'")
+        packages = " ".join(f"'{package}'" for package in packages_of(extra))
+        super().__init__(f"{purpose} needs a package that is not installed; run: pip install {packages}")

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from selfcorrect import words
 from selfcorrect.correct import Result
 from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
@@ -17,6 +18,8 @@ from selfcorrect.settings import Settings
 from selfcorrect.stages.stage import Start
 
 __all__ = ["Corrected", "Denoised", "Written", "channel_lines"]
+
+_SAMPLES = 250_000  # pixels that tell where most was gained
 
 
 def channel_lines(channels: Mapping[str, list[str]]) -> list[str]:
@@ -113,6 +116,7 @@ class Corrected:
         steps: of the optimiser.
         parameters: of the network; 0 without one.
         threads: of the CPU.
+        place: which tones gained most, in words; empty where nothing did.
         more: what else belongs into the attributes, by name: plain values.
         version: of selfcorrect.
     """
@@ -127,6 +131,7 @@ class Corrected:
     steps: int
     parameters: int
     threads: int
+    place: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
     version: str = field(default_factory=lambda: version("selfcorrect"))
 
@@ -146,6 +151,7 @@ class Corrected:
             steps=len(result.losses),
             parameters=0 if result.network is None else sum(p.numel() for p in result.network.parameters()),
             threads=torch.get_num_threads(),
+            place=_place(result),
             more=dict(more or {}),
         )
 
@@ -218,10 +224,23 @@ class Written:
         }
 
     def lines(self) -> list[str]:
-        """For the log: what was gained, what was clipped, and how long it took."""
+        """For the log: what was clipped, how long it took, and last what was gained, in words before numbers."""
         estimate = self.corrected.estimate
-        lines = [] if estimate is None else [str(estimate)]
+        lines = []
         if self.clipped:
             lines.append(f"{self.output}: {self.clipped} values beyond the range of half floats were clipped")
         spent = ", ".join(f"{name} {value:.1f} s" for name, value in self.corrected.seconds.items())
-        return [*lines, f"{self.output}: written after {self.seconds['total']:.1f} s ({spent})"]
+        lines.append(f"{self.output}: written after {self.seconds['total']:.1f} s ({spent})")
+        if estimate is not None:
+            lines.append(f"{self.output}: {words.closing(asdict(estimate), self.corrected.place)}")
+        return lines
+
+
+def _place(result: Result) -> str:
+    """Which tones gained most; some of the pixels tell."""
+    if result.estimate is None or not result.estimate.improved:
+        return ""
+    every = max(1, round((result.image.shape[0] * result.image.shape[1] / _SAMPLES) ** 0.5))
+    image = torch.as_tensor(result.image)[::every, ::every].cpu().double()
+    before, after = (result.maps[f"error.{when}"][::every, ::every].cpu() for when in ("before", "after"))
+    return words.where(image, before, after)

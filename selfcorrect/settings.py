@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from selfcorrect.errors import SettingsError
 
-__all__ = ["STAGE_NAMES", "Settings"]
+__all__ = ["STAGE_NAMES", "Settings", "seconds"]
 
 _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench/quality.py measures it"
@@ -16,10 +16,17 @@ _STAGES = "not in the paper; scripts/bench/stages.py measures it"
 
 
 def _setting(
-    default: Any, help_: str, source: str, *, choices: tuple[str, ...] = (), least: float = 0, unit: str = ""
+    default: Any,
+    help_: str,
+    source: str,
+    *,
+    choices: tuple[str, ...] = (),
+    least: float = 0,
+    unit: str = "",
+    everyday: bool = False,
 ) -> Any:
-    """A field with what the command's flag and the range check need."""
-    metadata = {"help": help_, "source": source, "choices": choices, "least": least, "unit": unit}
+    """A field with what the command's flag and the range check need; ``everyday``: no expert's, short help lists it."""
+    metadata = {"help": help_, "source": source, "choices": choices, "least": least, "unit": unit, "everyday": everyday}
     return field(default=default, metadata=metadata)
 
 
@@ -29,6 +36,23 @@ _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     float: ("a number", (int, float)),
     bool: ("true or false", (bool,)),
 }
+
+
+_SWITCHES = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+
+
+def seconds(text: str) -> float:
+    """Seconds from 10, 10s, 2m or 1h.
+
+    Raises:
+        SettingsError: it is no time.
+    """
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
+    try:
+        return float(number) * unit
+    except ValueError:
+        raise SettingsError(f"expected a time like 10s or 2m, but got {text!r}") from None
 
 
 def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) -> None:
@@ -140,7 +164,11 @@ class Settings:
         "not in the paper; scripts/bench/shot.py measures it",
     )
     time_budget: float = _setting(
-        0.0, "seconds for the whole frame: training takes what the rest leaves; 0 sets none", "the user's", unit="s"
+        0.0,
+        "seconds for the whole frame: training takes what the rest leaves; 0 sets none",
+        "the user's",
+        unit="s",
+        everyday=True,
     )
     seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
 
@@ -154,6 +182,27 @@ class Settings:
             raise SettingsError(f"expected an odd window of at most 31, but got {self.window}")
         if not self.steps and self.stride > self.patch:
             raise SettingsError(f"expected a stride of at most the patch ({self.patch}), but got {self.stride}")
+
+    @classmethod
+    def parsed(cls, name: str, text: str) -> Any:
+        """The value of one setting, as a person writes it.
+
+        Raises:
+            SettingsError: no such setting, or no such value.
+
+        >>> Settings.parsed("window", "7"), Settings.parsed("guard", "off"), Settings.parsed("time_budget", "2m")
+        (7, False, 120.0)
+        """
+        found = {f.name: f for f in fields(cls)}.get(name)
+        if found is None:
+            raise SettingsError(f"expected settings out of {', '.join(f.name for f in fields(cls))}, but got {name!r}")
+        kind: type[Any] = type(found.default)
+        if found.metadata["unit"] == "s":
+            return seconds(text)
+        try:
+            return _SWITCHES[text.lower()] if kind is bool else kind(text)
+        except (KeyError, ValueError):
+            raise SettingsError(f"expected {_KINDS[kind][0]} for the setting {name}, but got {text!r}") from None
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -114,20 +114,19 @@ def point(name: str, base: Settings, *, guarded: bool = False) -> Point:
 
 def _changes(name: str, text: str) -> dict[str, Any]:
     """The settings that ``FIELD=VALUE,…`` names."""
-    kinds: dict[str, type] = {f.name: type(f.default) for f in fields(Settings)}
+    known = {f.name for f in fields(Settings)}
     changes: dict[str, Any] = {}
     for part in text.split(","):
         key, equals, value = part.partition("=")
-        if not equals or key not in kinds:
+        if not equals or key not in known:
             presets = ", ".join(Settings.presets())
             raise SettingsError(
                 f"expected a point out of {presets}, {BASE}, {WARM} or SETTING=VALUE,…, but got {name!r}"
             )
-        kind = kinds[key]
         try:
-            changes[key] = {"true": True, "false": False}[value.lower()] if kind is bool else kind(value)
-        except (KeyError, ValueError):
-            raise SettingsError(f"expected {key} as {kind.__name__} in the point {name!r}, but got {value!r}") from None
+            changes[key] = Settings.parsed(key, value)
+        except SettingsError as error:
+            raise SettingsError(f"the point {name!r}: {error}") from None
     return changes
 
 

@@ -31,6 +31,7 @@ CORRECTED = facts.Corrected(
     steps=17,
     parameters=20303,
     threads=2,
+    place="mostly in the highlights",
     more={"frame": 3},
 )
 WRITTEN = facts.Written("out.exr", 4, {"write": 0.01, "total": 2.0}, CORRECTED)
@@ -80,13 +81,27 @@ def test_log() -> None:
         "candidate oidn:fast: left out, a few crops promise 0 % less error",
     ]
     assert WRITTEN.lines() == [
-        "relMSE ≈ 0.02 → 0.015 (-25 ± 3 %)",
         "out.exr: 4 values beyond the range of half floats were clipped",
         "out.exr: written after 2.0 s (train 1.0 s, infer 0.2 s)",
+        "out.exr: error about 25 % lower, mostly in the highlights (relMSE ≈ 0.02 → 0.015, -25 ± 3 %)",
     ]
     unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None))
-    assert unguarded.lines() == WRITTEN.lines()[2:]
+    assert unguarded.lines() == WRITTEN.lines()[1:2]
     assert unguarded.to_dict()["estimate"] is None
+
+
+def closing(**changes: object) -> str:
+    estimate = replace(ESTIMATE, **changes)
+    return replace(WRITTEN, corrected=replace(CORRECTED, estimate=estimate, place="")).lines()[-1]
+
+
+def test_the_last_words_are_for_artists() -> None:
+    kept = "out.exr: kept the denoised image: the two halves do not agree that the correction is better"
+    assert closing(improved=False) == f"{kept} (relMSE ≈ 0.02)"
+    shared = closing(improved=False, independent=False)
+    assert shared.startswith("out.exr: kept the denoised image: the two halves share their noise")
+    assert "relMSE" not in shared
+    assert closing(change=-0.001).startswith("out.exr: error less than 1 % lower (relMSE")
 
 
 def test_what_a_frame_started_from() -> None:

@@ -1,6 +1,7 @@
 """The rule of the house: data walks one way, and only the command prints."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import selfcorrect
 
 PACKAGE = Path(selfcorrect.__file__).parent
 ORDER = (
-    {"errors", "publish", "buffers", "settings"},
+    {"errors", "publish", "buffers", "settings", "words"},
     {"image"},
     {"kernel"},
     {"frame", "exr"},
@@ -27,6 +28,11 @@ LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
 BUILD = {Path("kernel/cross_bilateral/rows.py")}  # run by the build, which reads what it prints
 OUTSIDE = {Path("__init__.py"), Path("__main__.py")}  # what the package shows of itself, and how it is started
+
+
+ROOT = Path(__file__).parents[1]
+NAMED = re.compile(r"(?<![\w/*.>-])(?:tests|scripts)/[\w/.-]*\w")
+"""Paths of the checkout in sources and prose."""
 
 
 def room_of(module: Path) -> str:
@@ -68,6 +74,11 @@ def prints(source: str) -> bool:
     return False
 
 
+def missing(text: str) -> list[str]:
+    """Paths of the checkout that a text names and that are not there."""
+    return sorted({path for path in NAMED.findall(text) if not (ROOT / path).exists()})
+
+
 def test_every_module_has_its_room() -> None:
     assert {room_of(module) for module in MODULES if module not in OUTSIDE} == set(LEVEL)
 
@@ -80,6 +91,28 @@ def test_no_module_imports_from_a_room_above_it() -> None:
 def test_only_the_command_prints() -> None:
     others = [module for module in MODULES if room_of(module) != "cli" and module not in BUILD]
     assert [module for module in others if prints((PACKAGE / module).read_text(encoding="utf-8"))] == []
+
+
+def test_paths_that_texts_name_are_there() -> None:
+    kinds = {".py", ".md", ".toml", ".yaml", ".js", ".h", ".cpp", ".txt", ""}
+    rooms = [*(ROOT / name for name in ("selfcorrect", "denoisers", "scripts", "tests")), ROOT]
+    files = {path for room in rooms[:-1] for path in room.rglob("*") if path.suffix in kinds and path.is_file()}
+    files |= {path for path in ROOT.iterdir() if path.suffix in {".md", ".toml"}}
+    texts = {path.relative_to(ROOT): path.read_text(encoding="utf-8") for path in files - {Path(__file__)}}
+    assert {str(path): names for path, text in texts.items() if (names := missing(text))} == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("``tests/test_memory.py`` holds it", ["tests/test_memory.py"]),
+        ("see scripts/bench/quality.py, and tests/cli/test_memory.py.", []),
+        ("python scripts/nothing", ["scripts/nothing"]),
+        ("bpy/*/scripts/addons_core of Blender", []),
+    ],
+)
+def test_a_missing_path_would_be_seen(text: str, names: list[str]) -> None:
+    assert missing(text) == names
 
 
 @pytest.mark.parametrize(

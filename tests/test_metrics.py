@@ -11,6 +11,7 @@ import OpenEXR
 import pytest
 import torch
 from helpers.images import SHAPE, radiance
+from helpers.tolerances import EXACT, SSIM, STANDARD_ERROR, TEMPORAL
 
 from selfcorrect import metrics
 from selfcorrect.errors import FrameError
@@ -26,7 +27,7 @@ def test_relmse_with_one_reference() -> None:
     expected = sum(
         (x[i, j, k] - r[i, j, k]) ** 2 / (r[i, j].mean() ** 2 + 0.01) for i, j, k in np.ndindex(SHAPE)
     ) / math.prod(SHAPE)
-    assert metrics.relmse(x, r) == pytest.approx(expected, rel=1e-12)
+    assert metrics.relmse(x, r) == pytest.approx(expected, rel=EXACT, abs=0)
 
 
 def test_relmse_with_two_references_and_a_smooth_one() -> None:
@@ -34,8 +35,8 @@ def test_relmse_with_two_references_and_a_smooth_one() -> None:
     product = (x - a) * (x - b)
     smooth = np.mean(product / (s.mean(axis=2, keepdims=True) ** 2 + 0.01))
     mean = np.mean(product / (((a + b) / 2).mean(axis=2, keepdims=True) ** 2 + 0.01))
-    assert metrics.relmse(x, a, b, s) == pytest.approx(smooth, rel=1e-12)
-    assert metrics.relmse(x, a, b) == pytest.approx(mean, rel=1e-12)
+    assert metrics.relmse(x, a, b, s) == pytest.approx(smooth, rel=EXACT, abs=0)
+    assert metrics.relmse(x, a, b) == pytest.approx(mean, rel=EXACT, abs=0)
     assert smooth != pytest.approx(mean, rel=0.01)
 
 
@@ -49,9 +50,9 @@ def test_temporal_error() -> None:
         return float(np.mean(product / level))
 
     pairs = (tuple(a), tuple(b))
-    assert metrics.temporal_error(x, y, *pairs, tuple(s)) == pytest.approx(expected(s), rel=1e-12)
+    assert metrics.temporal_error(x, y, *pairs, tuple(s)) == pytest.approx(expected(s), rel=EXACT, abs=0)
     means = [(a[i] + b[i]) / 2 for i in (0, 1)]
-    assert metrics.temporal_error(x, y, *pairs) == pytest.approx(expected(means), rel=1e-12)
+    assert metrics.temporal_error(x, y, *pairs) == pytest.approx(expected(means), rel=EXACT, abs=0)
 
 
 def test_temporal_error_knows_flicker_and_no_static_error() -> None:
@@ -65,7 +66,7 @@ def test_temporal_error_knows_flicker_and_no_static_error() -> None:
     references = [tuple(truth + noise(0.2) for _ in range(2)) for _ in "ab"]
     smooth = (truth, truth)
     static = noise(0.1)
-    assert metrics.temporal_error(truth + static, truth + static, *references, smooth) == pytest.approx(0, abs=0.02)
+    assert metrics.temporal_error(truth + static, truth + static, *references, smooth) == pytest.approx(0, abs=TEMPORAL)
     one, two = truth + noise(0.5), truth + noise(0.5)
     both = metrics.relmse(one, truth) + metrics.relmse(two, truth)
     assert metrics.temporal_error(one, two, *references, smooth) == pytest.approx(both, rel=0.05)
@@ -137,7 +138,7 @@ def test_standard_error_of_equal_tiles_in_closed_form() -> None:
     errors = values**2 / 1.01
     x = reference + tiled(values)
     exact = np.std(errors) / math.sqrt(errors.size)
-    assert metrics.relmse_standard_error(x, reference) == pytest.approx(exact, rel=0.08)
+    assert metrics.relmse_standard_error(x, reference) == pytest.approx(exact, rel=STANDARD_ERROR)
 
 
 def test_short_tiles_weigh_their_pixels() -> None:
@@ -149,7 +150,7 @@ def test_short_tiles_weigh_their_pixels() -> None:
         (errors * pixels)[list(drawn)].sum() / pixels[list(drawn)].sum()
         for drawn in itertools.product(range(3), repeat=3)
     ]
-    assert metrics.relmse(x, reference) == pytest.approx((errors * pixels).sum() / 37)
+    assert metrics.relmse(x, reference) == pytest.approx((errors * pixels).sum() / 37, rel=EXACT, abs=0)
     assert metrics.relmse_standard_error(x, reference) == pytest.approx(np.std(outcomes), rel=0.08)
     across = metrics.relmse_standard_error(x.transpose(1, 0, 2), reference.transpose(1, 0, 2))
     assert across == metrics.relmse_standard_error(x, reference)
@@ -178,14 +179,14 @@ def test_ratio_of_errors_in_proportion_is_certain() -> None:
     r = radiance(0)
     offset = radiance(1)
     ratio = metrics.relmse_ratio(r + 0.5 * offset, r + offset, r)
-    assert ratio.value == pytest.approx(0.25, rel=1e-12)
-    assert ratio.standard_error == pytest.approx(0, abs=1e-12)
+    assert ratio.value == pytest.approx(0.25, rel=EXACT, abs=0)
+    assert ratio.standard_error == pytest.approx(0, abs=EXACT)
 
 
 def test_ratio_uses_every_reference() -> None:
     x, y, a, b, s = (radiance(seed) for seed in range(5))
     ratio = metrics.relmse_ratio(x, y, a, b, s).value
-    assert ratio == pytest.approx(metrics.relmse(x, a, b, s) / metrics.relmse(y, a, b, s), rel=1e-12)
+    assert ratio == pytest.approx(metrics.relmse(x, a, b, s) / metrics.relmse(y, a, b, s), rel=EXACT, abs=0)
 
 
 def test_paired_standard_error_is_the_spread_of_the_ratio() -> None:
@@ -198,7 +199,7 @@ def test_paired_standard_error_is_the_spread_of_the_ratio() -> None:
         ratios.append((a**2).mean() / (b**2).mean())
         if seed < 30:
             estimate = metrics.relmse_ratio(reference + tiled(a), reference + tiled(b), reference)
-            assert estimate.value == pytest.approx(ratios[-1], rel=1e-12)
+            assert estimate.value == pytest.approx(ratios[-1], rel=EXACT, abs=0)
             claims.append(estimate.standard_error)
     assert np.mean(claims) == pytest.approx(np.std(ratios, ddof=1), rel=0.1)
     image = reference + tiled(a)
@@ -221,8 +222,8 @@ def test_ratio_to_no_error_is_refused() -> None:
 
 def test_mean_radiance_ratio() -> None:
     x, r = radiance(0), radiance(1)
-    assert metrics.mean_radiance_ratio(x, r) == pytest.approx(x.sum() / r.sum(), rel=1e-12)
-    assert metrics.mean_radiance_ratio(r * 0.67, r) == pytest.approx(0.67, rel=1e-12)
+    assert metrics.mean_radiance_ratio(x, r) == pytest.approx(x.sum() / r.sum(), rel=EXACT, abs=0)
+    assert metrics.mean_radiance_ratio(r * 0.67, r) == pytest.approx(0.67, rel=EXACT, abs=0)
     with pytest.raises(FrameError, match=r"a mean radiance above 0, but got 0$"):
         metrics.mean_radiance_ratio(x, np.zeros(SHAPE))
 
@@ -247,7 +248,7 @@ def test_compare_is_the_sum_of_its_parts() -> None:
 
 def test_compare_with_itself_is_perfect() -> None:
     comparison = metrics.compare(radiance(), radiance())
-    assert dataclasses.astuple(comparison) == (0, 0, math.inf, pytest.approx(1, abs=1e-6), 0, 1)
+    assert dataclasses.astuple(comparison) == (0, 0, math.inf, pytest.approx(1, abs=SSIM), 0, 1)
 
 
 TWO_IMAGES = [metrics.relmse, metrics.relmse_standard_error, metrics.psnr, metrics.ssim, metrics.flip]

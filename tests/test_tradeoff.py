@@ -96,8 +96,8 @@ class TestPoints:
             ("quick", "expected a point out of balanced"),
             ("window", "SETTING=VALUE"),
             ("speed=3", "SETTING=VALUE"),
-            ("window=wide", "expected window as int in the point 'window=wide', but got 'wide'"),
-            ("guard=maybe", "expected guard as bool"),
+            ("window=wide", "the point 'window=wide': expected a whole number for the setting window, but got 'wide'"),
+            ("guard=maybe", "expected true or false for the setting guard"),
             ("window=8", "odd window"),
             ("quick:window=7", "expected a preset out of"),
         ],
@@ -195,7 +195,7 @@ class TestTelling:
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-        with pytest.raises(MissingPackageError, match=r"pip install 'selfcorrect\[bench\]'"):
+        with pytest.raises(MissingPackageError, match=r"pip install 'matplotlib>="):
             tradeoff.plot([measurement(1, 1)], "error")
         halves = [str(write_half(tmp_path / f"{i}.exr", i)) for i in range(2)]
         picture = tmp_path / "out.png"

@@ -16,27 +16,22 @@ The predictions assume, and nobody has measured:
 
 import argparse
 import json
-import re
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import torch
 import triton
-from kernel import ALL, SETS, best, make_guides
+from gpu_variants import Variant, programs_together, variants
+from kernel import ALL, best, make_guides
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
 
 from selfcorrect import Frame, Settings, correct
 from selfcorrect.kernel.convolution.reference import convolutions as convolutions_reference
-from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral_loss, gpu, heads_count, program
+from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral_loss, gpu, heads_count
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.stages.core.loss import dual_buffer_loss, relative_weight
 from selfcorrect.stages.core.network import Network
@@ -48,12 +43,6 @@ CONVOLUTION_SHARE = 0.4
 MEMORY_SHARE = 0.7
 LAUNCH = 8e-6
 REST = 0.1
-BUFFERS = {"y z": SETS["color"], "y z ρ n": SETS["color, albedo, normal"], "y z ρ n v": ALL}
-UNUSED = {"FORWARD": ("gradient", "target", "weight"), "BACKWARD": ("target", "weight"), "LOSS": ("image",)}
-"""Modes of the kernel, and which pointers they are not given."""
-
-TARGETS = (80, 90, 120)
-SHARED_LIMIT = 48 << 10  # bytes that a program may have on every card without asking for more
 SIZES = ((1024, 1024), (2160, 3840))
 
 
@@ -83,114 +72,6 @@ CARDS = (
     Card("RTX 3090", 80, 82, 1.695e9, 35.6e12, 71e12, 936e9),
     Card("H100 SXM", 90, 132, 1.755e9, 67e12, 990e12, 3350e9),
 )
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One specialisation of the device function, and what it was compiled to.
-
-    Attributes:
-        target: compute capability.
-        mode, buffers, window, every, combination: the specialisation.
-        registers: of a thread.
-        spilled: bytes of a thread's registers that lie in memory.
-        shared: bytes of a program.
-        instructions: of the innermost loop, which is one tap.
-        multiply_adds, loads: among those.
-    """
-
-    target: int
-    mode: str
-    buffers: str
-    window: int
-    every: int
-    combination: str
-    registers: int
-    spilled: int
-    shared: int
-    instructions: int
-    multiply_adds: int
-    loads: int
-
-
-def compiled(target: int, mode: str, buffers: str, window: int, every: int, combination: str) -> Variant:
-    """Compile one variant ahead of time."""
-    terms = gpu.terms_of(make_guides(8, BUFFERS[buffers]))
-    constants = gpu.specialisation(terms, Window(window, every, combination), gpu.TILE)
-    constants["MODE"] = getattr(program, mode).value
-    constants |= dict.fromkeys(UNUSED[mode])
-    pointers = {"corners": "*i64"} | dict.fromkeys(
-        ("planes", "raw", "image", "gradient", "target", "weight", "losses"), "*fp32"
-    )
-    names = program.program.arg_names
-    types = {name: "constexpr" if name in constants else pointers.get(name, "i32") for name in names}
-    source = ASTSource(program.program, signature=types, constexprs=constants)
-    options = {"num_warps": gpu.WARPS, "enable_fp_fusion": True}
-    result = triton.compile(source, target=GPUTarget("cuda", target, 32), options=options)
-    usage, code = dumped(result.asm["cubin"])
-    loop = innermost_loop(code)
-    return Variant(
-        target=target,
-        mode=mode,
-        buffers=buffers,
-        window=window,
-        every=every,
-        combination=combination,
-        registers=usage["REG"],
-        spilled=usage["STACK"] + usage["LOCAL"] + 4 * sum(name in ("LDL", "STL") for _, name, _ in code),
-        shared=max(usage["SHARED"], result.metadata.shared),
-        instructions=len(loop),
-        multiply_adds=loop.count("FFMA"),
-        loads=loop.count("LDG"),
-    )
-
-
-Code = list[tuple[int, str, str]]
-"""Address, name and operands of each instruction."""
-
-
-def dumped(cubin: bytes) -> tuple[dict[str, int], Code]:
-    """What cuobjdump, which comes with Triton, tells of a compiled program."""
-    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
-    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
-        file.write(cubin)
-        file.flush()
-        texts = [
-            subprocess.run([tool, flag, file.name], capture_output=True, text=True, check=True).stdout
-            for flag in ("--dump-resource-usage", "-sass")
-        ]
-    usage = {name: int(value) for name, value in re.findall(r"([A-Z]+):(\d+)", texts[0])}
-    line = re.compile(r"/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\w+\s+)?([A-Z0-9_]+)[^\s;]*\s*([^;]*);")
-    return usage, [(int(address, 16), name, operands) for address, name, operands in line.findall(texts[1])]
-
-
-def innermost_loop(code: Code) -> list[str]:
-    """Names of the instructions of the loop that has no other in it and evaluates an exponential."""
-    loops = []
-    for address, name, operands in code:
-        target = re.search(r"0x([0-9a-f]+)", operands)
-        if name == "BRA" and target and int(target[1], 16) < address:
-            body = [other for at, other, _ in code if int(target[1], 16) <= at <= address]
-            if "MUFU" in body:
-                loops.append(body)
-    return min(loops, key=len)
-
-
-def variants(*, few: bool) -> list[Variant]:
-    """Every one that the presets meet, with those of the settings; or one of each mode."""
-    if few:
-        return [compiled(t, m, "y z ρ n v", 19, 1, "eq10") for t in TARGETS for m in ("FORWARD", "LOSS")]
-    usual = product(TARGETS, UNUSED, BUFFERS, ((19, 1, "eq10"),))
-    others = product(
-        TARGETS, UNUSED, ("y z ρ n v",), ((19, 1, "eq3"), (19, 4, "eq10"), (31, 1, "eq10"), (7, 1, "eq10"))
-    )
-    return [compiled(t, m, b, *options) for t, m, b, options in (*usual, *others)]
-
-
-def programs_together(variant: Variant) -> int:
-    """How many of them a multiprocessor's 65,536 registers hold; a warp's are given out by 256."""
-    warp = -(-variant.registers * 32 // 256) * 256
-    return 65536 // (warp * gpu.WARPS)
 
 
 class _Counting(TorchDispatchMode):

@@ -4,6 +4,7 @@ Both samplers, the path tracer, the AOVs, and surfaces, textures and lights of e
 compile them ends the process; `variants.py` starts it and says what it found.
 """
 
+import argparse
 import importlib
 import sys
 from typing import Any
@@ -36,6 +37,7 @@ def scene(sampler: str) -> Any:
 
 
 def main() -> int:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     try:
         mi.set_variant("llvm_ad_rgb")
     except ImportError as error:

@@ -1,17 +1,17 @@
 """The command. Nothing outside this package prints: results go to stdout, everything else to stderr."""
 
-import argparse
 from collections.abc import Sequence
-from typing import NoReturn
+from importlib.metadata import version
 
-from selfcorrect.cli import bench, combine, compare, demo, frame, inspect, report, sequence
+from selfcorrect.cli import bench, combine, compare, completion, demo, frame, inspect, report, sequence, settings
+from selfcorrect.cli.help import Parser
 from selfcorrect.cli.terminal import log
-from selfcorrect.errors import SelfcorrectError, SettingsError, out_of_memory
+from selfcorrect.errors import SelfcorrectError, out_of_memory
 from selfcorrect.exr.file import one_line
 
 __all__ = ["main"]
 
-_COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, demo)
+_COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, settings, demo, completion)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,15 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if failed else 0
 
 
-class _Parser(argparse.ArgumentParser):
-    """One line for a wrong flag, like for every other wrong input."""
-
-    def error(self, message: str) -> NoReturn:
-        raise SettingsError(f"{message}; see {self.prog} --help")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="selfcorrect", description="Gives denoised Monte Carlo renders their detail back.")
+def _parser() -> Parser:
+    parser = Parser(prog="selfcorrect", description="Gives denoised Monte Carlo renders their detail back.")
+    parser.add_argument("--version", action="version", version=f"selfcorrect {version('selfcorrect')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for command in _COMMANDS:
         command.add(commands)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from selfcorrect import exr, files, report, tradeoff
-from selfcorrect.cli import flags, pages
+from selfcorrect.cli import flags, halves, pages
 from selfcorrect.cli.runner import Runner
 from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import SettingsError
@@ -24,8 +24,12 @@ _ERROR = "estimated relMSE over that of the denoised image"
 
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
-    parser = commands.add_parser("bench", help="what each second buys on this frame, and the preset to take")
-    flags.add_halves(parser)
+    parser = commands.add_parser(
+        "bench",
+        usage="%(prog)s A.exr B.exr [flags]",
+        help="what each second buys on this frame, and the preset to take",
+    )
+    halves.add(parser)
     parser.add_argument(
         "--points",
         nargs="+",
@@ -44,6 +48,7 @@ def add(commands: Any) -> None:
 
 
 def _bench(options: argparse.Namespace) -> None:
+    halves.check(options)
     if options.aov:
         raise SettingsError("expected no --aov with bench, which writes no image, but got one")
     if options.guard is False:

@@ -15,8 +15,8 @@ __all__ = ["add"]
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("compare", help="error of an image against one or two references")
-    parser.add_argument("image", metavar="IMAGE.exr")
-    parser.add_argument("reference", metavar="REF.exr")
+    parser.add_argument("image", metavar="IMAGE.exr", help="what is compared")
+    parser.add_argument("reference", metavar="REF.exr", help="what it should be")
     parser.add_argument("reference_b", metavar="REF2.exr", nargs="?", help="an independent second reference")
     parser.add_argument("--weight", metavar="SMOOTH.exr", help="smooth reference for the weight of relMSE")
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")

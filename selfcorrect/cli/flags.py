@@ -1,65 +1,125 @@
 """The flags that commands share, and what they say: settings, channel map, images that stages need."""
 
 import argparse
+import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import denoisers
-from selfcorrect.errors import SettingsError
-from selfcorrect.settings import Settings
+from selfcorrect.cli.help import Expert, add_help_all
+from selfcorrect.errors import FileError, SettingsError
+from selfcorrect.settings import Settings, seconds
 from selfcorrect.stages import STAGES
 from selfcorrect.stages.stage import Extra
 
-__all__ = ["add_extra", "add_halves", "add_run_flags", "denoised", "extra_files", "mapping", "settings_of"]
-
-
-def add_halves(parser: argparse.ArgumentParser) -> None:
-    """A frame's two halves, and their denoised images where the user has them."""
-    parser.add_argument("a", metavar="A.exr", help="half a; FILE.exr::LAYER chooses a layer")
-    parser.add_argument("b", metavar="B.exr", help="half b, rendered with another seed")
-    parser.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
-    parser.add_argument("--denoised-b", metavar="DB.exr")
-    parser.add_argument("--denoised", dest="denoised_full", metavar="D.exr", help="denoised mean of both halves")
+__all__ = [
+    "add_extra",
+    "add_preset",
+    "add_run_flags",
+    "add_settings",
+    "denoised",
+    "extra_files",
+    "mapping",
+    "settings_of",
+]
 
 
 def add_extra(parser: argparse.ArgumentParser) -> None:
     """Images beyond the halves that a stage needs."""
     for _, extra in _extras():
-        parser.add_argument(extra.flag, nargs=len(extra.files), metavar=extra.files, help=extra.help)
+        parser.add_argument(extra.flag, nargs=len(extra.files), metavar=extra.files, help=Expert(extra.help))
 
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags that every command with a correction takes; the settings' fields are among them."""
+    """The flags that every command with a correction takes. A flag is one row; help as :class:`Expert` hides it."""
     parser.add_argument("--denoiser", metavar="NAME", help=f"one of {' | '.join(denoisers.names())}")
-    parser.add_argument("--preset", default=Settings.default(), help=" | ".join(Settings.presets()))
-    parser.add_argument("--device", default="cpu", help="torch device: cpu, cuda, …")
+    add_preset(parser)
+    parser.add_argument("--device", default="cpu", help="torch device: cpu (the default), cuda, …")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads, by default all")
     parser.add_argument("--map", action="append", default=[], metavar="ROLE=CHANNEL", help="albedo=MyAlbedo, …")
     parser.add_argument(
         "--aov", type=_aov_names, default=[], metavar="error,blend", help="also write what the guard found, as channels"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    group = parser.add_argument_group("settings, by default those of the preset")
+    add_settings(parser)
+    add_help_all(parser)
+
+
+def add_preset(parser: argparse.ArgumentParser) -> None:
+    """The preset."""
+    names = [f"{name} (the default)" if name == Settings.default() else name for name in Settings.presets()]
+    parser.add_argument("--preset", default=Settings.default(), metavar="NAME", help=" | ".join(names))
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Single settings: from a file, by name, and each by a flag of its own, most of them for experts."""
+    parser.add_argument(
+        "--settings", dest="settings_file", metavar="FILE.toml", help="settings, a line NAME = VALUE for each"
+    )
+    parser.add_argument(
+        "--set",
+        dest="changes",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting; `selfcorrect settings` lists them",
+    )
     for f in fields(Settings):
+        shown: type[str] = str if f.metadata["everyday"] else Expert
         how: dict[str, Any] = {"type": type(f.default), "metavar": "|".join(f.metadata["choices"]) or "N"}
-        if f.metadata["unit"] == "s":
-            how = {"type": _seconds, "metavar": "10s"}
+        if f.metadata["unit"]:
+            how = {"type": seconds, "metavar": "10s"} if f.metadata["unit"] == "s" else {"metavar": "FILE"}
         if isinstance(f.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
-        if f.metadata["unit"] == "file":
-            group.add_argument(f"--{f.name.replace('_', '-')}", metavar="FILE", help=f.metadata["help"])
-            continue
-        presets = ", ".join(f"{name}: {getattr(s, f.name)}" for name, s in Settings.presets().items())
-        group.add_argument(
-            f"--{f.name.replace('_', '-')}", default=None, help=f"{f.metadata['help']} ({presets})", **how
-        )
+        parser.add_argument(_flag(f.name), default=None, help=shown(f.metadata["help"]), **how)
 
 
 def settings_of(options: argparse.Namespace) -> Settings:
-    """The preset, with what the flags change."""
-    changes = {f.name: getattr(options, f.name) for f in fields(Settings)}
-    return Settings.preset(options.preset, **{k: v for k, v in changes.items() if v is not None})
+    """The preset, with what --settings, --set and single flags change.
+
+    Raises:
+        SettingsError: a setting is unknown, out of its range, or given by --set and by a flag.
+    """
+    flags = {f.name: getattr(options, f.name) for f in fields(Settings)}
+    given = {name: value for name, value in flags.items() if value is not None}
+    named = {}
+    for change in options.changes:
+        name, equals, text = change.partition("=")
+        name = name.strip().replace("-", "_")
+        if not equals:
+            raise SettingsError(f"expected --set NAME=VALUE, but got {change!r}")
+        named[name] = Settings.parsed(name, text.strip())
+    if twice := sorted(given.keys() & named.keys()):
+        raise SettingsError(f"expected {twice[0]} once, but got --set {twice[0]} and {_flag(twice[0])}")
+    return Settings.preset(options.preset, **(_from_file(options.settings_file) | given | named))
+
+
+def _from_file(path: str | None) -> dict[str, Any]:
+    """The settings in a TOML file.
+
+    Raises:
+        FileError: it cannot be read.
+        SettingsError: it is no TOML, or has settings that there are not.
+    """
+    if path is None:
+        return {}
+    try:
+        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        Settings.from_dict(values)
+    except OSError as error:
+        raise FileError(f"{path}: expected a file of settings, but got: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: expected lines such as window = 7, but got: {error}") from None
+    except SettingsError as error:
+        raise SettingsError(f"{path}: {error}") from None
+    kinds = {f.name: type(f.default) for f in fields(Settings)}
+    return {name: float(value) if kinds[name] is float else value for name, value in values.items()}
+
+
+def _flag(setting: str) -> str:
+    return f"--{setting.replace('_', '-')}"
 
 
 def mapping(options: argparse.Namespace) -> dict[str, str]:
@@ -101,16 +161,6 @@ def _extras() -> Iterator[tuple[str, Extra]]:
 
 def _destination(extra: Extra) -> str:
     return extra.flag.removeprefix("--").replace("-", "_")
-
-
-def _seconds(text: str) -> float:
-    """Seconds from 10, 10s, 2m or 1h."""
-    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
-    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
-    try:
-        return float(number) * unit
-    except ValueError:
-        raise SettingsError(f"expected a time like 10s or 2m, but got {text!r}") from None
 
 
 def _aov_names(text: str) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from selfcorrect import exr, files
-from selfcorrect.cli import flags, memory, pages
+from selfcorrect.cli import flags, halves, memory, pages
 from selfcorrect.cli.runner import Runner
 from selfcorrect.cli.terminal import EndOnInterrupt, answer, log
 from selfcorrect.facts import Written
@@ -18,10 +18,10 @@ __all__ = ["add", "correct_files"]
 
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
-    parser = commands.add_parser("frame", help="correct one frame")
-    flags.add_halves(parser)
+    parser = commands.add_parser("frame", usage="%(prog)s A.exr B.exr -o OUT.exr [flags]", help="correct one frame")
+    halves.add(parser)
     flags.add_extra(parser)
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.exr")
+    parser.add_argument("-o", "--output", metavar="OUT.exr", help="half a with its colour corrected")
     parser.add_argument(
         "--maxmem",
         metavar="SIZE",
@@ -34,6 +34,7 @@ def add(commands: Any) -> None:
 
 
 def _frame(options: argparse.Namespace) -> None:
+    halves.check(options, "output")
     sources = files.Sources(options.a, options.b, **flags.denoised(options), mapping=flags.mapping(options))
     page = pages.FramePage.at(options.report)
     gather = None if page is None else page.gather

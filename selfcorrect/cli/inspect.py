@@ -13,7 +13,7 @@ __all__ = ["add"]
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("inspect", help="which channels a file has, and which would be used for what")
-    parser.add_argument("file", metavar="FILE.exr")
+    parser.add_argument("file", metavar="FILE.exr", help="any OpenEXR file")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.set_defaults(run=_inspect)
 

@@ -1,6 +1,7 @@
 """How much memory a frame takes, known from the headers of its files before anything is read.
 
-What is counted is what is held for every pixel; `tests/test_memory.py` holds it against the peak of the real command.
+What is counted is what is held for every pixel; `tests/cli/test_memory.py` holds it against the peak of the real
+command.
 """
 
 import math

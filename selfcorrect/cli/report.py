@@ -8,7 +8,7 @@ from torch import Tensor
 
 import denoisers
 from selfcorrect import exr, files, metrics, report
-from selfcorrect.cli import flags, pages
+from selfcorrect.cli import flags, halves, pages
 from selfcorrect.cli.terminal import log
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.frame import Frame
@@ -23,9 +23,9 @@ _AGAIN = tuple(name for name in denoisers.names() if ":" not in name)
 def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("report", help="a page to look at a corrected frame, for any browser")
-    flags.add_halves(parser)
+    halves.add(parser, alone=False)
     parser.add_argument("corrected", metavar="OUT.exr", help="what `selfcorrect frame` wrote; with --aov, it has maps")
-    parser.add_argument("-o", "--output", required=True, metavar="PAGE.html")
+    parser.add_argument("-o", "--output", required=True, metavar="PAGE.html", help="the page")
     parser.add_argument("--reference", metavar="REF.exr", help="a reference to look at and to measure against")
     parser.add_argument("--denoiser", metavar="NAME", help="who denoises again; by default who did it for OUT.exr")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads of the denoiser, by default all")

@@ -25,10 +25,10 @@ def add(commands: Any) -> None:
     parser = commands.add_parser("sequence", help="correct the frames of a shot, each from the last one's network")
     parser.add_argument("a", metavar="A.####.exr", help="half a; #### or %%04d stands for the frame number")
     parser.add_argument("b", metavar="B.####.exr", help="half b, rendered with another seed")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.####.exr")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.####.exr", help="one for each frame")
     parser.add_argument("--frames", required=True, metavar="RANGE", help="1-240, 1-240x2, 1-3,5,7-20:2, …")
     parser.add_argument("--denoised-a", metavar="DA.####.exr", help="denoised half a, instead of a denoiser")
-    parser.add_argument("--denoised-b", metavar="DB.####.exr")
+    parser.add_argument("--denoised-b", metavar="DB.####.exr", help="denoised half b")
     parser.add_argument("--denoised-full", metavar="D.####.exr", help="denoised mean of both halves")
     parser.add_argument(
         "--skip-existing", action="store_true", help="leave out frames whose output is whole and made the same way"

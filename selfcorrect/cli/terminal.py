@@ -76,13 +76,12 @@ class Progress:
             self._bar.close()
 
     def __call__(self, step: int, steps: int, loss: float) -> None:
-        """Tell of an optimiser step."""
+        """Tell of an optimiser step; not of its loss, which is that of a few patches and wanders from step to step."""
         if self._meanwhile is not None:
             self._meanwhile()
         if sys.stderr is not None and sys.stderr.isatty():
             if self._bar is None:
                 self._bar = tqdm(total=steps, desc="training", unit="step", file=sys.stderr)
-            self._bar.set_postfix(loss=f"{loss:.4g}")
             self._bar.update(step - self._bar.n)
         elif step * 10 // steps > (step - 1) * 10 // steps:
-            log(f"training: step {step} of {steps}, loss {loss:.5g}")
+            log(f"training: step {step} of {steps}")

@@ -1,8 +1,8 @@
-// A frame: its layers in the viewer, and where it is shown reduced, the region that was changed most as it is.
+// A frame: its layers in the viewer, and where it is shown reduced, the region that was changed most in detail.
 
 const viewer = new Viewer(document.getElementById("viewer"));
 const regions = [{ label: "Whole frame, reduced", left: 0, top: 0, ...data }];
-if (data.detail) regions.push({ label: "Most changed, every pixel", ...data.detail });
+if (data.detail) regions.push(data.detail);
 const buttons = regions.map((region) => make("button", { type: "button", onclick: () => open(region) }, region.label));
 if (regions.length > 1) {
   const group = make("div", { class: "group", role: "group", "aria-label": "Region" }, make("span", { class: "name" }, "Region"), ...buttons);

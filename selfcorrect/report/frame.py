@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcorrect.report import words
+from selfcorrect import words
 from selfcorrect.report.html import assembled, facts_sections, section
 from selfcorrect.report.pack import LARGEST_PAGE, Packed, fitted, reduced
 
@@ -37,7 +37,7 @@ def frame_page(
         facts: what the command prints with --json, as far as it is known; ``title`` names the page, ``relmse`` holds
             errors against the reference by image.
         limit: largest page, in bytes. Frames that do not fit are rounded, then reduced, and the region that was changed
-            most is kept as it is; the page says so.
+            most is kept as it was given; the page says so, and how many of the frame's pixels one of those is.
 
     Returns:
         HTML that needs no other file.
@@ -86,7 +86,12 @@ def _detail(images: Mapping[str, Any], scale: float, budget: int) -> dict[str, A
     packed = fitted({name: image[square] for name, image in images.items()}, budget)
     if next(iter(packed.values())).width < next(iter(images.values()))[square].shape[1]:
         return None
-    return {"scale": scale, "left": left * scale, "top": top * scale, "layers": layers(packed)}
+    label = "Most changed, every pixel" if scale == 1 else f"Most changed, {_by(scale)} pixels in one"
+    return {"label": label, "scale": scale, "left": left * scale, "top": top * scale, "layers": layers(packed)}
+
+
+def _by(scale: float) -> str:
+    return f"{scale:.2g} × {scale:.2g}"
 
 
 def layers(packed: Mapping[str, Packed]) -> list[dict[str, Any]]:
@@ -100,7 +105,7 @@ def note(full: Mapping[str, int], shown: Packed) -> str:
     if full["width"] != shown.width:
         parts.append(
             f"This page shows {shown.width} × {shown.height} pixels, each the mean of about "
-            f"{full['width'] / shown.width:.2g} × {full['width'] / shown.width:.2g} of the frame's, to stay small."
+            f"{_by(full['width'] / shown.width)} of the frame's, to stay small."
         )
     if shown.bits < 10:
         parts.append("Values are rounded by up to 0.4 %.")

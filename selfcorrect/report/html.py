@@ -10,8 +10,8 @@ from importlib import resources
 from string import Template
 from typing import Any
 
-from selfcorrect.report.words import number
 from selfcorrect.settings import Settings
+from selfcorrect.words import number
 
 __all__ = ["assembled", "facts_sections", "section", "table"]
 

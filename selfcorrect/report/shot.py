@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcorrect.report import words
+from selfcorrect import words
 from selfcorrect.report.frame import LABELS, layers, note, viewer
 from selfcorrect.report.html import assembled, facts_sections, section, table
 from selfcorrect.report.pack import LARGEST_PAGE, Array, fitted, pack, shrunk

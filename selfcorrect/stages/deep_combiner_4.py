@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
+import torch
 from torch import Tensor
 
 from selfcorrect.buffers import COLOR, FEATURES
@@ -70,6 +71,12 @@ class SubImages:
         images, repairs = checked(COLOR, tuple(denoised), names, frame.size)
         return replace(self, denoised=images, repairs=self.repairs | {"denoised_sub_images": repairs})
 
+    def to(self, device: str | torch.device) -> "SubImages":
+        """These with all their tensors on ``device``."""
+        images = tuple(image.to(device) for image in self.images)
+        denoised = None if self.denoised is None else tuple(image.to(device) for image in self.denoised)
+        return replace(self, images=images, denoised=denoised)
+
 
 def _check_mean(half: str, color: Tensor, pair: tuple[Tensor, ...]) -> None:
     """Raise where the sub-images have another mean than their half."""
@@ -109,7 +116,4 @@ class DeepCombiner4(DeepCombinerStage):
         if not isinstance(given, SubImages) or given.denoised is None:
             got = "such as are not denoised; call sub_images.denoise(frame, denoiser)" if given else "none"
             raise FrameError(f"expected four denoised sub-images for the stage {self.name}, but got {got}")
-        noisy, denoised = (
-            [image.to(state.full.device) for image in images] for images in (given.images, given.denoised)
-        )
-        return self.combined(self.network_4, noisy, denoised, state.halves, state.scale)
+        return self.combined(self.network_4, given.images, given.denoised, state.halves, state.scale)

@@ -4,10 +4,10 @@ Each half's radiance is fitted by the other half's features: fitted by its own, 
 it takes some of that noise back.
 
 Which half is a fit then independent of? Of neither: the fit of x^a by features of b sees b through the denoised image
-among them, and a as its target, where every pixel has a share of its own fit. ``tests/test_regression.py`` measures
-both by simulation, as the covariance of the fit with each half's noise over the variance of that noise: with OIDN
-0.026 of a and 0.006 of b, with joint-bilateral 0.024 and 0.036, where the whole squared error of the fit is 0.02 and
-0.03. Halves that are to be judged by their witness therefore need :func:`own_buffer_regression`.
+among them, and a as its target, where every pixel has a share of its own fit. ``tests/stages/test_regression.py``
+measures both by simulation, as the covariance of the fit with each half's noise over the variance of that noise: with
+OIDN 0.026 of a and 0.006 of b, with joint-bilateral 0.024 and 0.036, where the whole squared error of the fit is 0.02
+and 0.03. Halves that are to be judged by their witness therefore need :func:`own_buffer_regression`.
 """
 
 import torch

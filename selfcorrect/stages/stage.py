@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
 from selfcorrect.frame import Frame
@@ -70,7 +71,7 @@ class Work:
         warm_start: the network of the last frame.
         progress: called as ``progress(step, steps, loss)`` after every optimiser step.
         stop: asked before every optimiser step; when it says True, training ends.
-        extra: what the stage's :class:`Extra` made for this frame.
+        extra: what the stage's :class:`Extra` made for this frame, on the device that the images are on.
         keep: given to the last stage, if anybody wants its halves: a stage that makes them a strip of rows at a time
             hands them over here and need not hold them; then the halves of its outcome are those it was given.
     """
@@ -92,6 +93,10 @@ class Images(Protocol):
 
     def denoise(self, frame: Frame, denoiser: Callable[..., Any]) -> "Images":
         """These with their denoised images."""
+        ...
+
+    def to(self, device: str | torch.device) -> "Images":
+        """These with all their tensors on ``device``."""
         ...
 
 

@@ -1,7 +1,7 @@
 """Trained networks on whole images, tile by tile: their memory does not grow with the frame.
 
 A tile's network sees as much around it as reaches its outputs, so that tiles are equal to the whole but for rounding:
-the convolutions may sum in an order that depends on their size. ``tests/test_trained_stages.py`` holds radiance near 1
+the convolutions may sum in an order that depends on their size. ``tests/stages/test_tiled.py`` holds radiance near 1
 to 1e-6 in single precision; found was 1e-7. In bfloat16 a weight may round to its neighbour, by 2⁻⁸ of itself, which
 with the 25 weights of the tests' network moves a pixel by 2⁻⁸ / 25 = 1.6e-4: seen in 5 of 12288 values; the test holds
 the largest difference to two such, and 99.9 % of all to 1e-4.

@@ -36,7 +36,7 @@ def test_page_of_a_frame_as_it_is_corrected(halves: Halves, tmp_path: Path) -> N
     assert names(page) == ["noisy", "denoised", "corrected", "error.before", "error.after", "blend"]
     layers = {layer["name"]: layer for layer in data_of(page.read_text())["layers"]}
     written = exr.load_half(report["output"]).buffers["color"]
-    np.testing.assert_allclose(np.moveaxis(unpacked(layers["corrected"]), 0, -1), written, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(np.moveaxis(unpacked(layers["corrected"]), 0, -1), written, rtol=2**-11, atol=1e-6)
     assert "All 3" in page.read_text()  # settings
 
 
@@ -56,7 +56,7 @@ def test_both_ways_show_the_same_images(halves: Halves, tmp_path: Path) -> None:
     assert run("report", *halves, out, "-o", second, "--threads", 1).returncode == 0
     for one, two in zip(*(data_of(page.read_text())["layers"] for page in (first, second)), strict=True):
         assert one["name"] == two["name"]
-        np.testing.assert_allclose(unpacked(one), unpacked(two), rtol=2e-3, atol=1e-6)
+        np.testing.assert_allclose(unpacked(one), unpacked(two), rtol=2**-11, atol=1e-6)
 
 
 def test_a_frame_with_nan(halves: Halves, tmp_path: Path) -> None:

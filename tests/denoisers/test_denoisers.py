@@ -293,7 +293,9 @@ class TestSpecifications:
     ) -> None:
         monkeypatch.setitem(sys.modules, package, None)
         monkeypatch.delitem(sys.modules, f"denoisers.{extra}", raising=False)
-        with pytest.raises(MissingPackageError, match=rf"{extra} needs .* pip install 'selfcorrect\[{extra}\]'"):
+        with pytest.raises(
+            MissingPackageError, match=rf"{extra} needs .* pip install '{package.replace('_', '-')}>=[\d.]+'$"
+        ):
             denoisers.create(spec)
 
     def test_importing_the_package_imports_no_denoiser(self) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 import pytest
 from helpers.onnx_models import NCHW, NHWC, Shape, convolution, info, save, sum_of
+from helpers.tolerances import HALF_MODEL
 from helpers.views import make_view
 from onnx import TensorProto, helper
 
@@ -78,7 +79,7 @@ def test_a_half_model_is_fed_what_half_can_hold(tmp_path: Path) -> None:
     image[3, 4] = 1e6
     assert (denoise(image)[3, 4] == 65504).all()
     bright = np.full((2, 2, 3), 1e6)  # brought into the range that denoisers are used to
-    np.testing.assert_allclose(denoise(bright), bright, rtol=2**-10)
+    np.testing.assert_allclose(denoise(bright), bright, rtol=HALF_MODEL)
 
 
 def test_threads_are_honoured(tmp_path: Path) -> None:

@@ -89,3 +89,11 @@ def worst(got: Tensor, expected: Tensor) -> float:
     assert got.isfinite().all()
     expected = expected.detach().double()
     return float((got.detach().cpu().double() - expected).abs().max() / expected.abs().max().clamp(min=1e-9))
+
+
+def by_norm(got: Tensor, expected: Tensor) -> float:
+    """Norm of the difference, over that of the expected values."""
+    assert got.shape == expected.shape
+    assert got.isfinite().all()
+    expected = expected.detach().double()
+    return float((got.detach().cpu().double() - expected).norm() / expected.norm().clamp(min=1e-9))

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from helpers.kernel import TOLERANCE
+from helpers.tolerances import near
 from torch import Tensor, nn
 
 from selfcorrect import Settings
@@ -232,7 +233,7 @@ def test_every_backend_gives_the_same() -> None:
         expected = convolution.convolutions(images, parameters, region=region, backend="reference")
         got = convolution.convolutions(images, parameters, region=region)
         assert torch.equal(got, convolution.convolutions(images, parameters, region=region, backend="cpu"))
-    torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(got, expected, **near("convolution views"))
     with pytest.raises(SettingsError, match="at most 16 channels for the backend cpu"):
         convolution.convolutions(images, list(make_network(6, 6, filters=17).parameters()), backend="cpu")
     with pytest.raises(FrameError, match="expected images of one shape"):

@@ -6,6 +6,7 @@ from functools import partial
 import pytest
 import torch
 from helpers.kernel import ALWAYS, EVERY_SET, TOLERANCE, Terms, make_guides, make_raw, names, single, worst
+from helpers.tolerances import near
 from torch import Tensor
 
 from selfcorrect.buffers import TERMS
@@ -277,7 +278,7 @@ def test_every_backend_gives_the_same(backend: str) -> None:
     loss = (*arguments, guides.denoised, guides.planes[3].abs())
     for function, given in ((cross_bilateral, arguments), (cross_bilateral_loss, loss)):
         chosen, got = function(*given, Window(3)), function(*given, Window(3), backend=backend)
-        torch.testing.assert_close(got, chosen, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(got, chosen, **near("cross-bilateral on others"))
         assert backend != "cpu" or torch.equal(got, chosen)
 
 
@@ -303,7 +304,7 @@ def test_patches_read_neighbours_from_the_whole_image() -> None:
     raw = make_raw(guides, "eq10", (1, 30, 40)).float()
     whole = cross_bilateral(guides, raw, ORIGIN, Window(19))
     part = cross_bilateral(guides, raw[:, :, 8:20, 3:36], torch.tensor([[8, 3]]), Window(19))
-    torch.testing.assert_close(part, whole[:, :, 8:20, 3:36], rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(part, whole[:, :, 8:20, 3:36], **near("cross-bilateral in part"))
 
 
 def test_bad_arguments_are_named() -> None:

@@ -6,6 +6,7 @@ from functools import partial
 import pytest
 import torch
 from helpers.kernel import TOLERANCE as TABLE
+from helpers.tolerances import EXACT, near
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
@@ -44,7 +45,7 @@ def test_reference_by_hand() -> None:
                 total += float(top / (1e-10 + 0.6**2 * (v[at] + v[other])))
     expected = math.exp(-max(0.0, total / (3 * 25)))
     assert 0.05 < expected < 0.95
-    assert float(got[(*p, (dy + 3) * 7 + dx + 3)]) == pytest.approx(expected, rel=1e-9)
+    assert float(got[(*p, (dy + 3) * 7 + dx + 3)]) == pytest.approx(expected, rel=EXACT, abs=0)
 
 
 @pytest.mark.parametrize("isa", VARIANTS)
@@ -117,7 +118,7 @@ def test_regression_with_these_weights(isa: str) -> None:
         d = feature[row, column] - feature[at]
         said = models[at][:, 0] + torch.einsum("ti,tik->tk", d, models[at][:, 1:])
         expected = (w[row, column][:, None] * said).sum(0) / w[row, column].sum()
-        torch.testing.assert_close(got[row, column].double(), expected, atol=2e-5, rtol=2e-5)
+        torch.testing.assert_close(got[row, column].double(), expected, **near("nlm in place"))
 
 
 @pytest.mark.parametrize("isa", VARIANTS)

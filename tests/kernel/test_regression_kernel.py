@@ -3,6 +3,7 @@
 import pytest
 import torch
 from helpers.kernel import TOLERANCE as TABLE
+from helpers.tolerances import REGRESSION_EXACT
 from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
@@ -115,7 +116,7 @@ def test_an_affine_function_of_the_features_is_found() -> None:
     features, _ = make((30, 40))
     targets = 2 + features[0] - 3 * features[1] + features[3]
     result = regress(features, targets, window=15, ridge=1e-7, bandwidth=10.0)
-    torch.testing.assert_close(result.double(), targets, atol=2e-4, rtol=0)
+    torch.testing.assert_close(result.double(), targets, atol=REGRESSION_EXACT, rtol=0)
 
 
 def test_threads_do_not_change_a_bit() -> None:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from helpers.pages import ESTIMATE, FACTS, data_of, images, maps, unpacked
 
-from selfcorrect import report
-from selfcorrect.report import words
+from selfcorrect import report, words
 from selfcorrect.report.pack import pack, reduced
 from selfcorrect.settings import Settings
 
@@ -121,6 +120,18 @@ class TestFramePage:
         left, top = int(detail["left"]), int(detail["top"])
         crop = np.moveaxis(unpacked(detail["layers"][1]), 0, -1)
         np.testing.assert_array_equal(crop, large["corrected"][top : top + 320, left : left + 320])
+        assert detail["label"] == "Most changed, every pixel"
+
+    def test_a_frame_that_came_reduced_promises_no_pixels(self) -> None:
+        """Above two megapixels the page is given means of pixels: its detail is none of the frame's own."""
+        generator = np.random.default_rng(4)
+        large = {
+            name: generator.gamma(1.0, 1.0, (540, 960, 3)).astype(np.float16) for name in ("denoised", "corrected")
+        }
+        facts = FACTS | {"size": {"width": 1920, "height": 1080}}
+        page = report.frame_page(large, {}, facts, limit=6_000_000)
+        assert data_of(page)["detail"]["label"] == "Most changed, 2 × 2 pixels in one"
+        assert "every pixel" not in page
 
     def test_rounds_before_it_reduces(self) -> None:
         image = {"denoised": np.random.default_rng(5).gamma(1.0, 1.0, (128, 128, 3)).astype(np.float16)}

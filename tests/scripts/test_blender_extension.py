@@ -16,7 +16,7 @@ from helpers.render_scripts import BLENDER, BLENDER_TAKEN, done
 from selfcorrect import exr
 
 HERE = Path(__file__).resolve().parent
-INSTALL = "pip install 'selfcorrect[oidn]'"
+INSTALL = "pip install '.[oidn]' in the folder of selfcorrect"
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ import torch
 import train
 from denoiser import TAPS, Denoiser, filtered, filtered_reference
 from helpers.render_scripts import CHECKOUT
+from helpers.tolerances import SAMPLES
 from helpers.views import make_view, write_dataset
 from samples import HALVES, MEMBERS, SINGLES, WHOLE, Memory, draw, spread
 from torch import Tensor
@@ -106,7 +107,7 @@ class TestSamples:
                 torch.testing.assert_close(image, sample.target)
             if sample.albedo.any():
                 ratio = sample.target / sample.albedo
-                torch.testing.assert_close(ratio, ratio.mean().expand_as(ratio), rtol=1e-4, atol=0)
+                torch.testing.assert_close(ratio, ratio.mean().expand_as(ratio), rtol=SAMPLES, atol=0)
 
     def test_spreading_outliers_keeps_the_light(self) -> None:
         level = torch.full((3, 64, 64), 0.5)

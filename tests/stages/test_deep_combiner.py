@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from helpers.kernel import by_norm, worst
+from helpers.tolerances import COMBINER_EXTREME, COMBINER_EXTREME_BF16, COMBINER_EXTREME_BF16_GRADIENT, near
 from torch import Tensor
 
 from selfcorrect.image.windows import reflect, reflected
@@ -85,7 +87,7 @@ def test_four_buffers_reject_an_outlier() -> None:
     expected = combined(weights, reflected(noisy - denoised, 2), denoised, 5)
     noisy[:, 2], denoised[:, 2] = 50.0, 30.0
     got = combined(weights, reflected(noisy - denoised, 2), denoised, 5)
-    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(got, expected, **near("combiner and outlier"))
 
 
 def test_an_untrained_one_adds_the_local_mean_residual() -> None:
@@ -98,22 +100,28 @@ def test_an_untrained_one_adds_the_local_mean_residual() -> None:
 
 @pytest.mark.parametrize("extreme", [0.0, 1e6, 1e15])
 @pytest.mark.parametrize("buffers", [1, 4])
-def test_extremes_give_finite_values_and_gradients(buffers: int, extreme: float) -> None:
+def test_extremes_give_the_values_and_gradients_of_double_precision(buffers: int, extreme: float) -> None:
     noisy, denoised, features = images((11, 10), buffers)
     if extreme:
         noisy[..., 4, 4], denoised[..., 2, 2] = extreme, extreme
     else:
         noisy, denoised, features = (torch.zeros_like(planes) for planes in (noisy, denoised, features))
-    network = DeepCombiner(buffers, **SMALL)
-    for autocast in (False, True):
-        network.zero_grad()
-        inputs = noisy.clone().requires_grad_(), denoised.clone().requires_grad_()
+
+    def image_and_gradients(kind: torch.dtype, *, autocast: bool = False) -> list[Tensor]:
+        network = DeepCombiner(buffers, **SMALL).to(kind)
+        inputs = [planes.to(kind, copy=True).requires_grad_() for planes in (noisy, denoised)]
         with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-            image = network(*inputs, features)
+            image = network(*inputs, features.to(kind))
         image.mean().backward()
-        assert image.isfinite().all()
-        gradients = [p.grad for p in network.parameters()] + [planes.grad for planes in inputs]
-        assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
+        return [image, *(leaf.grad for leaf in (*network.parameters(), *inputs))]
+
+    expected = image_and_gradients(torch.float64)
+    for got, true in zip(image_and_gradients(torch.float32), expected, strict=True):
+        assert worst(got, true) <= COMBINER_EXTREME
+    image, *gradients = image_and_gradients(torch.float32, autocast=True)
+    assert by_norm(image, expected[0]) <= COMBINER_EXTREME_BF16
+    for got, true in zip(gradients, expected[1:], strict=True):
+        assert by_norm(got, true) <= COMBINER_EXTREME_BF16_GRADIENT
 
 
 def test_half_precision_is_near() -> None:
@@ -123,7 +131,7 @@ def test_half_precision_is_near() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         half = network(noisy, denoised, features)
     assert half.dtype == torch.float32
-    torch.testing.assert_close(half, single, rtol=5e-3, atol=5e-3)
+    torch.testing.assert_close(half, single, **near("combiner in bfloat16"))
 
 
 def test_seeds() -> None:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers.tolerances import LOSS_BY_HAND, RATE, near
 
 from selfcorrect import Frame, Settings, correct
 from selfcorrect.buffers import TERMS
@@ -69,7 +70,7 @@ def test_relu_between_and_zero_padding() -> None:
         padded = torch.nn.functional.pad(expected, (1, 1, 1, 1))
         expected = torch.nn.functional.conv2d(padded, convolution.weight, convolution.bias)
         expected = expected.relu() if i < 8 else expected
-    torch.testing.assert_close(network(x), expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(network(x), expected, **near("network by hand"))
 
 
 def test_heads_are_nine_scales_five_bandwidths_one_centre_weight() -> None:
@@ -118,7 +119,7 @@ def test_learning_rate_is_a_hundredth_of_the_halves_deviation() -> None:
     a, b = (half.planes[:3, 9:-9, 9:-25] for half in guides)
     assert a.shape == (3, 12, 10)
     expected = 0.01 * math.sqrt(float((a - b).square().mean()) / 4)
-    assert learning_rate(guides, PAPER) == pytest.approx(expected, rel=1e-6)
+    assert learning_rate(guides, PAPER) == pytest.approx(expected, rel=RATE)
 
 
 def test_loss_is_eq8() -> None:
@@ -133,7 +134,7 @@ def test_loss_is_eq8() -> None:
         cut = other.patches(corners, (8, 8))
         y, z = cut[:, :3], cut[:, -3:]
         terms.append((g - y) ** 2 / (z.mean(1, keepdim=True) ** 2 + 0.01))
-    assert loss == pytest.approx(float((0.5 * (terms[0] + terms[1])).mean()), rel=1e-5)
+    assert loss == pytest.approx(float((0.5 * (terms[0] + terms[1])).mean()), rel=LOSS_BY_HAND)
 
 
 def test_first_bandwidths_and_names_of_the_buffers() -> None:
@@ -187,4 +188,4 @@ def test_result_is_the_clipped_mean_of_both_outputs() -> None:
             raw = result.network(guides.patches(origin, (20, 24)))
         outputs.append(reference.cross_bilateral(guides, raw, origin, Window(19))[0].permute(1, 2, 0))
     expected = ((outputs[0] + outputs[1]) / 2).clamp(min=0)
-    torch.testing.assert_close(torch.from_numpy(result.image), expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(torch.from_numpy(result.image), expected, **near("paper by hand"))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.tolerances import near
 from quality import load
 
 import denoisers
@@ -29,7 +30,7 @@ def test_adam_is_that_of_torch(limit: float) -> None:
         reference.step()
         reference.zero_grad()
     for mine, other in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(mine, other, **near("Adam"))
 
 
 def test_a_gradient_that_is_not_finite_is_not_followed() -> None:

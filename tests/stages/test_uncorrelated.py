@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.tolerances import EXACT, near
 from torch import Tensor
 
 from selfcorrect import cli, exr
@@ -65,7 +66,7 @@ def test_eqs_5_and_8_by_hand(kernel: str, crossed: bool) -> None:
                     dy = sum(y[s][c] - y[s][at] for s in own) / 2
                     total = total + k / 225 * (dz - dy)
             results.append(float(total))
-        assert float(got[c]) == pytest.approx(sum(results) / 2, rel=1e-9)
+        assert float(got[c]) == pytest.approx(sum(results) / 2, rel=EXACT, abs=0)
 
 
 def test_unbiased_and_better_than_either_baseline() -> None:
@@ -134,7 +135,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     report = json.loads(capsys.readouterr().out)
     expected, gamma = combine(tuple(i.float() for i in y), tuple(i.float() for i in z), samples=16)
     assert report["gamma"] == gamma
-    np.testing.assert_allclose(exr.load_half(output).buffers["color"], expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(exr.load_half(output).buffers["color"], expected, **near("combine to file"))
     before = Path(output).read_bytes()
     small = write(tmp_path, "small", z[0][:5])
     assert cli.main(["combine", *paths[0], "--correlated", *paths[1][:3], small, "-o", output, "--samples", "16"]) == 2

@@ -10,7 +10,7 @@ import bpy
 
 from .job import Job, Step
 
-INSTALL = "pip install 'selfcorrect[oidn]'"
+INSTALL = "pip install '.[oidn]' in the folder of selfcorrect"
 RENDER_PART = 0.6  # of the time; the rest is correcting
 
 

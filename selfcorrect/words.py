@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KEPT", "change", "luminance", "number", "percent", "summary", "where"]
+__all__ = ["KEPT", "SHARED", "change", "closing", "luminance", "number", "percent", "summary", "where"]
 
 KEPT = "Kept the denoised image: the two halves do not agree that the correction is better"
+SHARED = "Kept the denoised image: the two halves share their noise and cannot judge; use another seed for one"
 
 _REC_709 = (0.2126, 0.7152, 0.0722)
 _STOP = 2.0  # how far from the frame's usual radiance shadows and highlights begin
@@ -20,11 +21,26 @@ def summary(estimate: Mapping[str, Any] | None, place: str = "") -> str:
     """ "Error about 31 % lower, mostly in the highlights", from the guard's estimate and :func:`where`."""
     if estimate is None:
         return "No estimate of the error"
+    if not estimate.get("independent", True):
+        return SHARED
     if not estimate["improved"]:
         return KEPT
     gain = -100 * estimate["change"]
     amount = f"about {gain:.0f} % lower" if gain >= 0.5 else "less than 1 % lower"
     return f"Error {amount}" + (f", {place}" if place else "")
+
+
+def closing(estimate: Mapping[str, Any], place: str = "") -> str:
+    """The same as the last words of a run, with the numbers behind them."""
+    words = summary(estimate, place)
+    told = f"{words[0].lower()}{words[1:]}"
+    if not estimate.get("independent", True):
+        return told
+    before, after = (f"{estimate[name]:.3g}" for name in ("denoised", "corrected"))
+    if not estimate["improved"]:
+        return f"{told} (relMSE ≈ {before})"
+    share, deviation = 100 * estimate["change"], 100 * estimate["standard_error"]
+    return f"{told} (relMSE ≈ {before} → {after}, {share:+.0f} ± {deviation:.0f} %)"
 
 
 def where(denoised: Any, before: Any, after: Any) -> str:
