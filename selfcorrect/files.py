@@ -15,10 +15,11 @@ from selfcorrect.buffers import FEATURES
 from selfcorrect.correct import COLOR_OUTPUT
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
 from selfcorrect.exr.limits import check_alike
+from selfcorrect.exr.passes import Others, means, picture
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
 
-__all__ = ["Images", "Loaded", "Origin", "Sources", "load", "load_images", "save", "save_combined"]
+__all__ = ["Images", "Loaded", "Origin", "Saved", "Sources", "load", "load_images", "save", "save_combined"]
 
 
 @dataclass(frozen=True)
@@ -54,17 +55,38 @@ class Sources:
 
 @dataclass(frozen=True)
 class Origin:
-    """The file of half a, whose pixels are not kept: what passes through is read again when it is written.
+    """The files of both halves, whose pixels are not kept: what passes through is read again when it is written.
 
     Attributes:
-        path: the file, with its layer.
+        path: half a's, with its layer.
         taken: role → channel names.
         stamp: what tells whether it has changed since.
+        other: half b's, with its layer.
+        other_stamp: likewise.
+        alike: both halves call the colour the same, so that their other channels can be told apart by name.
     """
 
     path: str
     taken: dict[str, list[str]]
     stamp: tuple[int, int, int]
+    other: str
+    other_stamp: tuple[int, int, int]
+    alike: bool
+
+    def reopened(self) -> tuple[exr.ExrFile, exr.ExrFile | None]:
+        """Half a; and half b, where the halves' other channels can be told apart by name.
+
+        Raises:
+            FileError: a file has changed since it was read.
+        """
+        a = _unchanged(self.path, self.stamp)
+        return a, _unchanged(self.other, self.other_stamp) if self.alike else None
+
+
+def _unchanged(path: str, stamp: tuple[int, int, int]) -> exr.ExrFile:
+    if _stamp(path) != stamp:
+        raise FileError(f"{path}: expected the file that was read, but got one changed since; run again")
+    return exr.read(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +111,7 @@ def load(sources: Sources) -> Loaded:
         FrameError: sizes do not fit.
     """
     _check_distinct(sources)
-    stamp = _stamp(sources.a)
+    stamps = _stamp(sources.a), _stamp(sources.b)
     check_alike(sources.paths)
     half_a, half_b = (_half(path, sources.mapping) for path in (sources.a, sources.b))
     height, width = half_a.buffers["color"].shape[:2]
@@ -123,7 +145,8 @@ def load(sources: Sources) -> Loaded:
         frame = Frame(**pairs)
     except FrameError as error:
         raise FrameError(f"{sources.a} (half a), {sources.b} (half b): {error}") from None
-    return Loaded(frame, Origin(sources.a, taken, stamp))
+    alike = half_a.taken["color"] == half_b.taken["color"]
+    return Loaded(frame, Origin(sources.a, taken, stamps[0], sources.b, stamps[1], alike))
 
 
 class _Half(NamedTuple):
@@ -150,27 +173,47 @@ def _stamp(path: str) -> tuple[int, int, int]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def save(path: str, origin: Origin, outputs: Mapping[str, Any], attributes: Mapping[str, str]) -> int:
-    """Write a frame's outputs with all else of half a.
+class Saved(NamedTuple):
+    """What was written: how many values lay beyond the range of half floats and were clipped, where the file holds
+    those, and what became of the channels beside the colour.
+    """
+
+    clipped: int
+    others: Others
+
+
+def save(
+    path: str,
+    origin: Origin,
+    outputs: Mapping[str, Any],
+    attributes: Mapping[str, str],
+    *,
+    pass_through: bool = False,
+) -> Saved:
+    """Write a frame's outputs with all else of the halves: what is linear in the samples as the mean of both
+    (:mod:`selfcorrect.exr.passes`), the rest as half a has it, bit by bit.
 
     Args:
         path: the file to write.
-        origin: half a.
-        outputs: images by name; ``color`` takes the place of half a's, any other becomes the channel
+        origin: the halves.
+        outputs: images by name; ``color`` takes the place of the picture, any other becomes the channel
             ``selfcorrect.NAME``.
         attributes: name → text.
-
-    Returns:
-        how many values lay beyond the range of half floats and were clipped, where the file holds those.
+        pass_through: every channel but the picture is half a's.
 
     Raises:
-        FileError: half a has changed since it was read, or the output cannot be written.
+        FileError: a half has changed since it was read, or the output cannot be written.
     """
-    if _stamp(origin.path) != origin.stamp:
-        raise FileError(f"{origin.path}: expected the file that was read, but got one changed since; run again")
-    file = exr.read(origin.path)
+    a, b = origin.reopened()
+    shown = picture(a.channel_names, origin.taken["color"])
+    planes: dict[str, Any] = {}
+    others = Others(0, len(a.channel_names) - len(shown))
+    if b is not None and not pass_through:
+        planes, others = means(a, b, but=shown)
+    del b
     extra = {f"selfcorrect.{name}": image for name, image in outputs.items() if name != COLOR_OUTPUT}
-    return exr.write(path, file, outputs[COLOR_OUTPUT], origin.taken["color"], attributes, extra=extra)
+    clipped = exr.write(path, a, outputs[COLOR_OUTPUT], shown, attributes, extra=extra, planes=planes)
+    return Saved(clipped, others)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,18 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads, by default all")
     parser.add_argument("--map", action="append", default=[], metavar="ROLE=CHANNEL", help="albedo=MyAlbedo, …")
     parser.add_argument(
-        "--aov", type=_aov_names, default=[], metavar="error,blend", help="also write what the guard found, as channels"
+        "--diagnostics",
+        type=_diagnostics,
+        default=[],
+        metavar="error,blend",
+        help="also write what the guard found, as channels",
+    )
+    parser.add_argument("--aov", dest="diagnostics", type=_diagnostics, help=argparse.SUPPRESS)  # its name of old
+    parser.add_argument(
+        "--pass-through",
+        action="store_true",
+        help="keep every channel but the picture as half a has it; by default those that are linear in the samples "
+        "become the mean of both halves",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     group = parser.add_argument_group("settings, by default those of the preset")
@@ -113,8 +124,10 @@ def _seconds(text: str) -> float:
         raise SettingsError(f"expected a time like 10s or 2m, but got {text!r}") from None
 
 
-def _aov_names(text: str) -> list[str]:
+def _diagnostics(text: str) -> list[str]:
     names = text.split(",")
     if not set(names) <= {"error", "blend"}:
-        raise SettingsError(f"expected --aov error, blend or both, but got {text!r}")
+        raise SettingsError(
+            f"expected --diagnostics error, blend or both, but got {text!r}; AOVs of the file are --aovs"
+        )
     return names

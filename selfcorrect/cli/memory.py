@@ -115,7 +115,7 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
         read=_BASE + half + held + max(stored, half) + beyond,
         denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * beyond + candidates,
         correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * beyond + candidates,
-        write=_BASE + _WORK + 2 * image + held + max(stored, held),
+        write=_BASE + _WORK + 2 * image + 2 * held + max(stored, held),  # both halves, and what is made of them
     )
 
 

@@ -67,9 +67,9 @@ class Runner:
 
     def __init__(self, options: argparse.Namespace, *, given: bool, scratch: int | None = None):
         self.settings = flags.settings_of(options)
-        if options.aov and not self.settings.guard:
-            aov = ",".join(options.aov)
-            raise SettingsError(f"expected the guard with --aov {aov}, but got settings that turn it off")
+        if options.diagnostics and not self.settings.guard:
+            named = ",".join(options.diagnostics)
+            raise SettingsError(f"expected the guard with --diagnostics {named}, but got settings that turn it off")
         self._stages = stages.opened(self.settings)
         self._extra_files = flags.extra_files(options, self.settings)
         if given and options.denoiser is None:
@@ -142,7 +142,7 @@ class Runner:
         if gather is not None:
             gather(frame, result)
         corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, more)
-        return Corrected(loaded.origin, _outputs(result, self._options.aov), result.network, corrected, began)
+        return Corrected(loaded.origin, _outputs(result, self._options.diagnostics), result.network, corrected, began)
 
     def prepare(self, loaded: files.Loaded, began: float) -> Prepared:
         """Read what stages need beyond the halves, denoise where that is to be done, and tell of it."""
@@ -177,11 +177,16 @@ class Runner:
     def write(self, output: str, corrected: Corrected) -> facts.Written:
         """Write a frame, and tell of it."""
         start = time.perf_counter()
-        clipped = files.save(output, corrected.origin, corrected.outputs, corrected.facts.attributes())
-        now = time.perf_counter()
-        written = facts.Written(
-            output, clipped, {"write": now - start, "total": now - corrected.began}, corrected.facts
+        saved = files.save(
+            output,
+            corrected.origin,
+            corrected.outputs,
+            corrected.facts.attributes(),
+            pass_through=self._options.pass_through,
         )
+        now = time.perf_counter()
+        seconds = {"write": now - start, "total": now - corrected.began}
+        written = facts.Written(output, saved.clipped, saved.others, seconds, corrected.facts)
         log(*written.lines())  # in one piece: another frame may be in work meanwhile
         return written
 
@@ -205,9 +210,9 @@ def _extra(stage: str) -> Extra:
     return extra
 
 
-def _outputs(result: Result, aov: list[str]) -> dict[str, Any]:
-    """The corrected colour, and the maps that --aov asks for."""
-    maps = {name: image.cpu().numpy() for name, image in result.maps.items() if name.partition(".")[0] in aov}
+def _outputs(result: Result, diagnostics: list[str]) -> dict[str, Any]:
+    """The corrected colour, and the maps that --diagnostics asks for."""
+    maps = {name: image.cpu().numpy() for name, image in result.maps.items() if name.partition(".")[0] in diagnostics}
     return {COLOR_OUTPUT: result.image, **maps}
 
 

@@ -56,7 +56,7 @@ def _sequence(options: argparse.Namespace) -> int:
     runner = Runner(options, given=options.denoised_a is not None)
     how = shot.Options(
         runner.settings,
-        {"denoiser": runner.denoiser, "aov": options.aov},
+        {"denoiser": runner.denoiser, "diagnostics": options.diagnostics, "pass through": options.pass_through},
         skip_existing=options.skip_existing,
         cold=options.cold,
         warm_start=None if options.warm_start is None else _given(options.warm_start, runner.settings),
