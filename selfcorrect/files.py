@@ -3,23 +3,38 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from selfcorrect import exr
+from selfcorrect.aovs import AovSum, Denoise, correct_alone, correct_aovs
 from selfcorrect.buffers import FEATURES
 from selfcorrect.correct import COLOR_OUTPUT
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
+from selfcorrect.exr.aovs import Halves, Plan, plan, planes_of, written_color
 from selfcorrect.exr.limits import check_alike
 from selfcorrect.exr.passes import Others, means, picture
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
 
-__all__ = ["Images", "Loaded", "Origin", "Saved", "Sources", "load", "load_images", "save", "save_combined"]
+__all__ = [
+    "Aovs",
+    "Images",
+    "Loaded",
+    "Origin",
+    "Saved",
+    "Sources",
+    "correct_aovs_of",
+    "load",
+    "load_images",
+    "save",
+    "save_combined",
+]
 
 
 @dataclass(frozen=True)
@@ -33,6 +48,7 @@ class Sources:
         denoised_b: denoised half b.
         denoised_full: denoised mean of both halves.
         mapping: role → channel, for what no table knows.
+        aovs: which AOVs are corrected: None, ``none``, ``auto``, or names (:func:`selfcorrect.exr.aovs.plan`).
     """
 
     a: str
@@ -41,6 +57,7 @@ class Sources:
     denoised_b: str | None = None
     denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
+    aovs: str | None = None
 
     @property
     def inputs(self) -> tuple[str | None, ...]:
@@ -64,6 +81,7 @@ class Origin:
         other: half b's, with its layer.
         other_stamp: likewise.
         alike: both halves call the colour the same, so that their other channels can be told apart by name.
+        plan: the AOVs to correct.
     """
 
     path: str
@@ -72,6 +90,7 @@ class Origin:
     other: str
     other_stamp: tuple[int, int, int]
     alike: bool
+    plan: Plan = field(default_factory=Plan)
 
     def reopened(self) -> tuple[exr.ExrFile, exr.ExrFile | None]:
         """Half a; and half b, where the halves' other channels can be told apart by name.
@@ -146,7 +165,19 @@ def load(sources: Sources) -> Loaded:
     except FrameError as error:
         raise FrameError(f"{sources.a} (half a), {sources.b} (half b): {error}") from None
     alike = half_a.taken["color"] == half_b.taken["color"]
-    return Loaded(frame, Origin(sources.a, taken, stamps[0], sources.b, stamps[1], alike))
+    origin = Origin(sources.a, taken, stamps[0], sources.b, stamps[1], alike)
+    return Loaded(frame, replace(origin, plan=_plan(origin, sources.aovs, half_a.taken)))
+
+
+def _plan(origin: Origin, wanted: str | None, taken: Mapping[str, list[str]]) -> Plan:
+    if wanted is None or wanted == "none":
+        return Plan()
+    a, b = origin.reopened()
+    if b is None:
+        raise ChannelError(
+            f"{origin.other}: expected the colour's channels of {origin.path} for --aovs, but got others"
+        )
+    return plan(a, b, taken["color"], wanted, "".join(taken.get("alpha", [])[:1]))
 
 
 class _Half(NamedTuple):
@@ -189,6 +220,7 @@ def save(
     attributes: Mapping[str, str],
     *,
     pass_through: bool = False,
+    aovs: Mapping[str, Any] | None = None,
 ) -> Saved:
     """Write a frame's outputs with all else of the halves: what is linear in the samples as the mean of both
     (:mod:`selfcorrect.exr.passes`), the rest as half a has it, bit by bit.
@@ -199,21 +231,97 @@ def save(
         outputs: images by name; ``color`` takes the place of the picture, any other becomes the channel
             ``selfcorrect.NAME``.
         attributes: name → text.
-        pass_through: every channel but the picture is half a's.
+        pass_through: every channel but the picture and the AOVs that were corrected is half a's.
+        aovs: channels of corrected AOVs by their full names.
 
     Raises:
         FileError: a half has changed since it was read, or the output cannot be written.
     """
     a, b = origin.reopened()
     shown = picture(a.channel_names, origin.taken["color"])
-    planes: dict[str, Any] = {}
-    others = Others(0, len(a.channel_names) - len(shown))
+    corrected, planes = dict(aovs or {}), dict[str, Any]()
+    others = Others(0, len(a.channel_names) - len(shown) - len(corrected))
     if b is not None and not pass_through:
-        planes, others = means(a, b, but=shown)
+        planes, others = means(a, b, but={*shown, *corrected})
     del b
+    planes |= corrected
+    others = others._replace(corrected=len(corrected))
     extra = {f"selfcorrect.{name}": image for name, image in outputs.items() if name != COLOR_OUTPUT}
     clipped = exr.write(path, a, outputs[COLOR_OUTPUT], shown, attributes, extra=extra, planes=planes)
     return Saved(clipped, others)
+
+
+class Aovs(NamedTuple):
+    """Corrected AOVs.
+
+    Attributes:
+        channels: full name → (height, width) array in the types of half a.
+        lines: what the log says of them.
+        facts: by name of a sum, how far it was from the picture in the noisy halves, how large the gap was that was
+            divided, and what is left of it, as shares of the picture.
+    """
+
+    channels: dict[str, Any]
+    lines: list[str]
+    facts: dict[str, dict[str, float]]
+
+
+def correct_aovs_of(origin: Origin, image: Any, frame: Frame, denoise: Denoise, *, pass_through: bool = False) -> Aovs:
+    """Correct the AOVs that were planned, one after the other.
+
+    Args:
+        origin: the halves.
+        image: the corrected picture.
+        frame: what it was made of.
+        denoise: see :func:`selfcorrect.aovs.denoiser_of`.
+        pass_through: colours that AOVs were divided by are written as half a has them.
+
+    Raises:
+        FileError: a half has changed since it was read.
+        FrameError: an AOV is of another size than the frame, or hardly finite.
+    """
+    a, b = origin.reopened()
+    assert b is not None  # there would be no plan
+    found, done, target = Aovs({}, [], {}), dict[str, Tensor](), torch.as_tensor(image).float().cpu()
+    for group in origin.plan.groups:
+        halves = Halves(a, b, group.aovs)
+        if group.sums:
+            colors = {
+                aov.name: torch.from_numpy(written_color(a, b, aov, pass_through=pass_through))
+                for aov in group.aovs
+                if aov.color is not None
+            }
+            shared = [aov.name for aov in group.aovs if aov.name in done]  # with a set that sums already
+            rest = target - sum(done[name] for name in shared) if shared else target
+            own = Halves(a, b, [aov for aov in group.aovs if aov.name not in shared])
+            corrected = correct_aovs(
+                rest.clamp(min=0), frame, AovSum(group.name, own, group.remainder, colors), denoise
+            )
+            images = corrected.images
+            found.facts[group.name] = {
+                "noisy": max(group.closing, default=0.0),
+                "gap": corrected.gap,
+                "left": corrected.closing,
+            }
+            found.lines.append(
+                f"AOVs: {group.name}: missed the picture by {100 * corrected.gap:.2g} %, which was divided among them; "
+                f"now within {corrected.closing:.1e}"
+            )
+        else:
+            images = {name: correct_alone(frame, name, halves[name], denoise) for name in halves}
+        done |= images
+        for aov in group.aovs:
+            if aov.name in group.wanted and aov.name in images:
+                found.channels.update(planes_of(a, b, aov, images[aov.name].numpy(), pass_through=pass_through))
+    if origin.plan.alpha:
+        found.channels[origin.plan.alpha] = _alpha(a, b, origin.plan.alpha, frame, denoise)
+    return found
+
+
+def _alpha(a: exr.ExrFile, b: exr.ExrFile, name: str, frame: Frame, denoise: Denoise) -> Any:
+    first, second = (np.repeat(file.pixels(name).astype(np.float32)[:, :, None], 3, -1) for file in (a, b))
+    image = correct_alone(frame, "alpha", (first, second), denoise)
+    return image.mean(-1).clamp(0, 1).numpy().astype(a.pixels(name).dtype)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ ORDER = (
     {"frame", "exr"},
     {"stages"},
     {"guard", "independence", "metrics"},
-    {"correct", "candidates", "history"},
+    {"correct", "candidates", "history", "aovs"},
     {"files", "facts"},
     {"shot", "tradeoff", "report"},
     {"cli"},

@@ -31,6 +31,12 @@ PASSES = (
     "z",
 )
 GROUPS = ("key", "fill")
+VIEWS = (
+    ((0.6, -5.2, 2.2), (0.0, 0.6, 0.75)),
+    ((-2.4, -3.2, 1.3), (0.3, 0.5, 0.5)),
+    ((3.0, -3.6, 1.7), (-0.6, 1.2, 0.7)),
+)
+"""Where the camera is, and what it looks at: the whole, the glass ball, and the room through the fog."""
 
 
 def material(name: str, shader: str, **inputs: object) -> bpy.types.Material:
@@ -86,7 +92,7 @@ def lamp(name: str, group: str, kind: str, energy: float, place: tuple[float, ..
     bpy.context.scene.collection.objects.link(held)
 
 
-def still_life() -> bpy.types.Scene:
+def still_life(view: int = 0) -> bpy.types.Scene:
     """The scene, with its passes on."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -131,10 +137,10 @@ def still_life() -> bpy.types.Scene:
     data = bpy.data.cameras.new("camera")
     data.lens = 32
     camera = bpy.data.objects.new("camera", data)
-    camera.location = (0.6, -5.2, 2.2)
+    camera.location, aim = VIEWS[view]
     look = camera.constraints.new("TRACK_TO")
     look.target, look.track_axis, look.up_axis = bpy.data.objects.new("aim", None), "TRACK_NEGATIVE_Z", "UP_Y"
-    look.target.location = (0.0, 0.6, 0.75)
+    look.target.location = aim
     for placed in (camera, look.target):
         scene.collection.objects.link(placed)
     scene.camera = camera
@@ -147,10 +153,11 @@ def main() -> None:
     parser.add_argument("--spp", type=even, default=64, metavar="N", help="of both halves together (default: 64)")
     parser.add_argument("--reference", type=int, default=2048, metavar="N", help="samples of the reference; 0: none")
     parser.add_argument("--size", type=size, default=(240, 160), metavar="WxH")
+    parser.add_argument("--view", type=int, default=0, choices=range(len(VIEWS)), help="of the camera")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0, help="of Cycles; 0: all")
     options = parser.parse_args(sys.argv[1:])
-    scene = still_life()
+    scene = still_life(options.view)
     if options.threads:
         scene.render.threads_mode, scene.render.threads = "FIXED", options.threads
     jobs = [(half, options.spp // 2) for half in HALVES]

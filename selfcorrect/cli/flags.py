@@ -11,7 +11,7 @@ from selfcorrect.settings import Settings
 from selfcorrect.stages import STAGES
 from selfcorrect.stages.stage import Extra
 
-__all__ = ["add_extra", "add_halves", "add_run_flags", "denoised", "extra_files", "mapping", "settings_of"]
+__all__ = ["add_aovs", "add_extra", "add_halves", "add_run_flags", "denoised", "extra_files", "mapping", "settings_of"]
 
 
 def add_halves(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,17 @@ def add_halves(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
     parser.add_argument("--denoised-b", metavar="DB.exr")
     parser.add_argument("--denoised", dest="denoised_full", metavar="D.exr", help="denoised mean of both halves")
+
+
+def add_aovs(parser: argparse.ArgumentParser) -> None:
+    """The AOVs to correct."""
+    parser.add_argument(
+        "--aovs",
+        default="none",
+        metavar="auto|NAME,NAME|none",
+        help="correct these AOVs so that they sum to the corrected picture; auto: every set of light passes or light "
+        "groups that sums to it in the render; alpha among the names: also that",
+    )
 
 
 def add_extra(parser: argparse.ArgumentParser) -> None:

@@ -10,6 +10,7 @@ import torch
 
 import denoisers
 from selfcorrect import facts, files, stages
+from selfcorrect.aovs import denoiser_of
 from selfcorrect.candidates import with_candidates
 from selfcorrect.cli import flags
 from selfcorrect.cli.terminal import Progress, log
@@ -41,6 +42,7 @@ class Corrected:
     Attributes:
         origin: its half a.
         outputs: the images to write, by name.
+        aovs: channels of corrected AOVs, by their full names.
         network: for the next frame to start from.
         facts: what is known of it.
         began: when the work on it began, by ``time.perf_counter``.
@@ -48,6 +50,7 @@ class Corrected:
 
     origin: files.Origin
     outputs: Mapping[str, Any]
+    aovs: Mapping[str, Any]
     network: Network | None
     facts: facts.Corrected
     began: float
@@ -72,6 +75,9 @@ class Runner:
             raise SettingsError(f"expected the guard with --diagnostics {named}, but got settings that turn it off")
         self._stages = stages.opened(self.settings)
         self._extra_files = flags.extra_files(options, self.settings)
+        wanted = getattr(options, "aovs", None) or "none"
+        if wanted != "none" and given and options.denoiser is None:
+            raise SettingsError(f"expected --denoiser NAME with --aovs {wanted}, which are denoised too, but got none")
         if given and options.denoiser is None:
             self._check_denoiser(" which have to be denoised too,")
         _use_machine(options)
@@ -141,8 +147,21 @@ class Runner:
             )
         if gather is not None:
             gather(frame, result)
-        corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, more)
-        return Corrected(loaded.origin, _outputs(result, self._options.diagnostics), result.network, corrected, began)
+        aovs, about = self._aovs(loaded.origin, frame, result)
+        corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, {**(more or {}), **about})
+        outputs = _outputs(result, self._options.diagnostics)
+        return Corrected(loaded.origin, outputs, aovs, result.network, corrected, began)
+
+    def _aovs(self, origin: files.Origin, frame: Frame, result: Result) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Channels of the AOVs that the user wants corrected, and what is to be told of them."""
+        if not origin.plan.written:
+            return {}, {}
+        assert self._denoise is not None  # checked before the frame was read
+        start = time.perf_counter()
+        denoise = denoiser_of(frame, self._denoise)
+        found = files.correct_aovs_of(origin, result.image, frame, denoise, pass_through=self._options.pass_through)
+        log(*found.lines, f"AOVs: {time.perf_counter() - start:.1f} s")
+        return found.channels, {"aovs": found.facts}
 
     def prepare(self, loaded: files.Loaded, began: float) -> Prepared:
         """Read what stages need beyond the halves, denoise where that is to be done, and tell of it."""
@@ -155,6 +174,10 @@ class Runner:
         if channels != self._told:  # of a shot, only where it changes
             log(*facts.channel_lines(channels))
         self._told = channels
+        if loaded.origin.plan.lines:
+            log(*loaded.origin.plan.lines)
+        if loaded.origin.plan.written and self._denoise is None:
+            raise SettingsError("expected --denoiser NAME with --aovs, which are denoised too, but got none")
         for doubt in doubts(frame):
             log(f"warning: {doubt}")
         denoiser, promises = "given", dict[str, float]()
@@ -183,6 +206,7 @@ class Runner:
             corrected.outputs,
             corrected.facts.attributes(),
             pass_through=self._options.pass_through,
+            aovs=corrected.aovs,
         )
         now = time.perf_counter()
         seconds = {"write": now - start, "total": now - corrected.began}

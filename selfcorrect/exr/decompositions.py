@@ -12,7 +12,7 @@ import numpy as np
 from selfcorrect.exr.file import ExrFile, Pixels
 from selfcorrect.exr.passes import DIVIDED, divided, rgb_passes
 
-__all__ = ["Aov", "Decomposition", "candidates", "closing_error", "fitted", "radiance", "tolerance"]
+__all__ = ["Aov", "Decomposition", "beside", "candidates", "closing_error", "fitted", "radiance", "tolerance"]
 
 Three = tuple[str, str, str]
 
@@ -64,18 +64,18 @@ class Decomposition:
 
 def candidates(names: Sequence[str], color: Sequence[str]) -> list[Decomposition]:
     """Sets of two AOVs or more beside the colour that conventionally sum to it, the finest first."""
-    beside = _beside(names, color)
-    by_pass = {name.casefold(): name for name in beside}
+    there = _beside(names, color)
+    by_pass = {name.casefold(): name for name in there}
     colors = divided(names)
 
     def aovs(wanted: Sequence[str]) -> tuple[Aov, ...]:
-        there = [by_pass[name.casefold()] for name in wanted if name.casefold() in by_pass]
-        return tuple(_aov(name, beside[name], colors) for name in dict.fromkeys(there))
+        own = [by_pass[name.casefold()] for name in wanted if name.casefold() in by_pass]
+        return tuple(_aov(name, there[name], colors) for name in dict.fromkeys(own))
 
     lights = [light for _, pair in DIVIDED for light in pair]
     found = [Decomposition("Blender's light passes", aovs([*lights, *_BLENDER_PLAIN]))]
     found += [
-        Decomposition(f"light groups {picture}_…", aovs([name for name in beside if _in_group(name, picture)]))
+        Decomposition(f"light groups {picture}_…", aovs([name for name in there if _in_group(name, picture)]))
         for picture in _GROUPED
     ]
     found += [
@@ -83,9 +83,15 @@ def candidates(names: Sequence[str], color: Sequence[str]) -> list[Decomposition
         Decomposition("lobes", aovs([*_lobes(by_pass, split=False), *_PLAIN])),
         Decomposition("direct and indirect light", aovs(["direct", "indirect", *_PLAIN])),
     ]
-    found += [Decomposition(f"AOVs {start}_…", aovs(group)) for start, group in _by_prefix(beside)]
+    found += [Decomposition(f"AOVs {start}_…", aovs(group)) for start, group in _by_prefix(there)]
     unique = {frozenset(one.aovs): one for one in reversed(found) if len(one.aovs) > 1}
     return [one for one in found if unique.get(frozenset(one.aovs)) is one]
+
+
+def beside(names: Sequence[str], color: Sequence[str]) -> list[Aov]:
+    """Every pass of R, G, B in the colour's layer but the colour itself, with the colour that it was divided by."""
+    colors = divided(names)
+    return [_aov(name, three, colors) for name, three in _beside(names, color).items()]
 
 
 def fitted(file: ExrFile, color: Sequence[str], taken: Sequence[str] = ()) -> Decomposition | None:
@@ -96,9 +102,11 @@ def fitted(file: ExrFile, color: Sequence[str], taken: Sequence[str] = ()) -> De
         color: full names of its colour.
         taken: passes to leave out, since a set that sums has them already.
     """
-    beside = {name: three for name, three in _beside(file.channel_names, color).items() if name not in taken}
-    colors = divided(file.channel_names)
-    aovs = [_aov(name, three, colors) for name, three in beside.items() if all(_is_float(file, c) for c in three)]
+    aovs = [
+        aov
+        for aov in beside(file.channel_names, color)
+        if aov.name not in taken and all(_is_float(file, channel) for channel in aov.channels)
+    ]
     if not 1 < len(aovs) <= _FITTED_SETS:
         return None
     target = np.stack([file.pixels(name).astype(np.float64) for name in color], -1).ravel()
@@ -183,10 +191,10 @@ def _lobes(there: dict[str, str], *, split: bool) -> Iterator[str]:
         yield from parts if parts and (split or lobe not in there) else [lobe]
 
 
-def _by_prefix(beside: dict[str, Three]) -> Iterator[tuple[str, list[str]]]:
+def _by_prefix(there: dict[str, Three]) -> Iterator[tuple[str, list[str]]]:
     """Groups of passes with the same beginning up to the first underscore."""
     groups: dict[str, list[str]] = {}
-    for name in beside:
+    for name in there:
         start, underscore, _ = name.partition("_")
         if underscore and start:
             groups.setdefault(start, []).append(name)

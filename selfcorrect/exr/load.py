@@ -40,7 +40,8 @@ class HalfFile:
 def load_picture(path: str | Path) -> tuple[NDArray[np.floating[Any]], list[str]]:
     """Read what people look at: the channels that an output's colour is written to, and their names.
 
-    They are the colour's, but where a file has a picture beside its noisy image; a layer that names a pass is that pass.
+    They are the colour's, but where a file has a picture beside its noisy image, that; a layer that names a pass is
+    that pass.
 
     Raises:
         FileError, ChannelError: as for :func:`load_half`.

@@ -17,7 +17,18 @@ import numpy as np
 
 from selfcorrect.exr.file import ExrFile, Pixels
 
-__all__ = ["DIVIDED", "TABLE", "Others", "Rule", "divided", "linear_channels", "means", "picture", "rgb_passes"]
+__all__ = [
+    "DIVIDED",
+    "TABLE",
+    "Others",
+    "Rule",
+    "divided",
+    "linear_channels",
+    "mean_of",
+    "means",
+    "picture",
+    "rgb_passes",
+]
 
 Kind = Literal["linear", "kept"]
 
@@ -162,7 +173,7 @@ def means(a: ExrFile, b: ExrFile, but: Collection[str]) -> tuple[dict[str, Pixel
     Returns:
         full name → (height, width) array in the type of half a; and what became of all channels beside ``but``.
     """
-    there, colors = set(b.channel_names), divided(a.channel_names)
+    there = set(b.channel_names)
     found, lacking = {}, []
     for name in linear_channels(a):
         if name in but:
@@ -170,11 +181,16 @@ def means(a: ExrFile, b: ExrFile, but: Collection[str]) -> tuple[dict[str, Pixel
         if name not in there or a.pixels(name).shape != b.pixels(name).shape:
             lacking.append(name)
             continue
-        color = colors.get(name)
-        weights = None if color is None or color not in there else (a.pixels(color), b.pixels(color))
-        found[name] = _mean(a.pixels(name), b.pixels(name), weights)
+        found[name] = mean_of(a, b, name)
     kept = sum(name not in found and name not in but for name in a.channel_names)
     return found, Others(len(found), kept, lacking=tuple(lacking))
+
+
+def mean_of(a: ExrFile, b: ExrFile, name: str) -> Pixels:
+    """One channel as the mean of both halves, (height, width) in the type of half a."""
+    color = divided(a.channel_names).get(name)
+    weights = None if color is None or color not in b.channel_names else (a.pixels(color), b.pixels(color))
+    return _mean(a.pixels(name), b.pixels(name), weights)
 
 
 def _mean(a: Pixels, b: Pixels, weights: tuple[Pixels, Pixels] | None) -> Pixels:
