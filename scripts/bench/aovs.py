@@ -3,12 +3,12 @@
     .venv-blender/bin/python scripts/render/light_passes.py -o FOLDER --reference 4096
     .venv/bin/python scripts/bench/aovs.py FOLDER [FOLDER …] [--preset fast] [--threads 1]
 
-Folders hold `passes_a.exr`, `passes_b.exr` and `passes_ref.exr`. Of every AOV, what it adds to the picture (light times
-its colour) is compared: the noisy mean of the halves; denoised, each AOV by itself (half a, half b and their mean with
-their G-buffers, as the picture is; the mean's is taken); the ratio method, each denoised AOV times the corrected picture
-over their sum; and ours, which is what `selfcorrect frame --aovs auto` writes. relMSE is that of the frames' metric,
-|x − r|² / (mean_rgb(r)² + 0.01), the mean over pixels. Closing: the root of the mean squared difference between the sum
-and the picture, relative to the picture: for noisy and denoised that of the same kind, for the others the corrected one.
+Folders hold `passes_a.exr`, `passes_b.exr` and `passes_ref.exr`. Of every AOV, what it adds to the picture (light
+times its colour) is compared: the noisy mean of the halves; denoised, each AOV by itself, as the picture is; the ratio
+method, each denoised AOV times the corrected picture over their sum; and ours, which is what `selfcorrect frame --aovs
+auto` writes. relMSE is the metric of the frames, |x - r|² / (mean_rgb(r)² + 0.01), the mean over pixels. Closing: the
+root of the mean squared difference between the sum and the picture, relative to the picture: for noisy and denoised
+that of the same kind, for the others the corrected one.
 """
 
 import argparse

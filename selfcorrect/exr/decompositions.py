@@ -79,8 +79,8 @@ def candidates(names: Sequence[str], color: Sequence[str]) -> list[Decomposition
         for picture in _GROUPED
     ]
     found += [
-        Decomposition("lobes, direct and indirect", aovs([*_lobes(by_pass, split=True), *_PLAIN])),
-        Decomposition("lobes", aovs([*_lobes(by_pass, split=False), *_PLAIN])),
+        Decomposition("Arnold's lobes", aovs([*_lobes(by_pass, split=True), *_PLAIN])),
+        Decomposition("Arnold's lobes, direct and indirect in one", aovs([*_lobes(by_pass, split=False), *_PLAIN])),
         Decomposition("direct and indirect light", aovs(["direct", "indirect", *_PLAIN])),
     ]
     found += [Decomposition(f"AOVs {start}_…", aovs(group)) for start, group in _by_prefix(there)]
