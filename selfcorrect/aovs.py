@@ -64,12 +64,15 @@ class AovSum:
             divided by a colour. A mapping that makes them when they are asked for keeps memory low.
         remainder: the AOVs are only a part of the picture; what they leave of it takes part, and is not given back.
         colors: (H, W, 3) colour by the name of each AOV that will be divided by it.
+        whole: they sum to the frame's picture; else, as where some of a set are known already, to what is left of it,
+            and their gap is divided by radiance alone.
     """
 
     name: str
     halves: Mapping[str, Pair]
     remainder: bool = False
     colors: Mapping[str, Tensor] = field(default_factory=dict)
+    whole: bool = True
 
 
 class Corrected(NamedTuple):
@@ -133,9 +136,10 @@ def correct_aovs(image: Any, frame: Frame, sums: AovSum, denoise: Denoise) -> Co
         parts[name] = _part(halves, denoise, scale, sums.colors.get(name))
         if name:
             repairs[name] = counts
-    gaps, totals = _gaps(frame, list(parts.values()), scale)
-    for name, (halves, _) in _noisy(frame, sums):
-        parts[name].share = _share(parts[name], halves, gaps, totals, scale)
+    if sums.whole:
+        gaps, totals = _gaps(frame, list(parts.values()), scale)
+        for name, (halves, _) in _noisy(frame, sums):
+            parts[name].share = _share(parts[name], halves, gaps, totals, scale)
     gap, closing = _reconcile_(list(parts.values()), target)
     return Corrected({name: part.x for name, part in parts.items() if name}, repairs, gap, closing)
 
@@ -219,10 +223,10 @@ def _checked(frame: Frame, name: str, halves: Pair) -> tuple[tuple[Tensor, Tenso
 def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: Tensor | None) -> _Part:
     """Step 1: an AOV denoised and blended, as a whole and of each half."""
     size = (halves[0].shape[0], halves[0].shape[1])
-    nothing = torch.zeros(1, 1, 1, dtype=torch.float64)
+    alike = torch.ones(1, 1, 1, dtype=torch.float64)
     if not any(bool(half.any()) for half in halves):
         dark = torch.zeros(*size, 3, dtype=torch.float16)
-        return _Part(torch.zeros(*size, 3), (dark, dark), color, nothing)
+        return _Part(torch.zeros(*size, 3), (dark, dark), color, alike)
     denoised, full = denoise(halves)
     y = (Scaled(halves[0], scale), Scaled(halves[1], scale))
     z = (Scaled(denoised[0], scale), Scaled(denoised[1], scale))
@@ -241,7 +245,7 @@ def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: 
             start = z[i][rows].double()
             blended = start + alpha * (y[i][rows].double() - start)
             half[rows] = torch.where(there, blended, 0.0).clamp(0, _LARGEST_HALF)
-    return _Part(x, kept, color, nothing)
+    return _Part(x, kept, color, alike)
 
 
 def _there(halves: tuple[Tensor, Tensor], color: Tensor | None, rows: slice) -> Tensor:

@@ -7,29 +7,25 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from selfcorrect import exr
-from selfcorrect.aovs import AovSum, Denoise, correct_alone, correct_aovs
 from selfcorrect.buffers import FEATURES
 from selfcorrect.correct import COLOR_OUTPUT
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
-from selfcorrect.exr.aovs import Halves, Plan, plan, planes_of, written_color
+from selfcorrect.exr.aovs import Plan, plan
 from selfcorrect.exr.limits import check_alike
 from selfcorrect.exr.passes import Others, means, picture
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
 
 __all__ = [
-    "Aovs",
     "Images",
     "Loaded",
     "Origin",
     "Saved",
     "Sources",
-    "correct_aovs_of",
     "load",
     "load_images",
     "save",
@@ -249,79 +245,6 @@ def save(
     extra = {f"selfcorrect.{name}": image for name, image in outputs.items() if name != COLOR_OUTPUT}
     clipped = exr.write(path, a, outputs[COLOR_OUTPUT], shown, attributes, extra=extra, planes=planes)
     return Saved(clipped, others)
-
-
-class Aovs(NamedTuple):
-    """Corrected AOVs.
-
-    Attributes:
-        channels: full name → (height, width) array in the types of half a.
-        lines: what the log says of them.
-        facts: by name of a sum, how far it was from the picture in the noisy halves, how large the gap was that was
-            divided, and what is left of it, as shares of the picture.
-    """
-
-    channels: dict[str, Any]
-    lines: list[str]
-    facts: dict[str, dict[str, float]]
-
-
-def correct_aovs_of(origin: Origin, image: Any, frame: Frame, denoise: Denoise, *, pass_through: bool = False) -> Aovs:
-    """Correct the AOVs that were planned, one after the other.
-
-    Args:
-        origin: the halves.
-        image: the corrected picture.
-        frame: what it was made of.
-        denoise: see :func:`selfcorrect.aovs.denoiser_of`.
-        pass_through: colours that AOVs were divided by are written as half a has them.
-
-    Raises:
-        FileError: a half has changed since it was read.
-        FrameError: an AOV is of another size than the frame, or hardly finite.
-    """
-    a, b = origin.reopened()
-    assert b is not None  # there would be no plan
-    found, done, target = Aovs({}, [], {}), dict[str, Tensor](), torch.as_tensor(image).float().cpu()
-    for group in origin.plan.groups:
-        halves = Halves(a, b, group.aovs)
-        if group.sums:
-            colors = {
-                aov.name: torch.from_numpy(written_color(a, b, aov, pass_through=pass_through))
-                for aov in group.aovs
-                if aov.color is not None
-            }
-            shared = [aov.name for aov in group.aovs if aov.name in done]  # with a set that sums already
-            rest = target - sum(done[name] for name in shared) if shared else target
-            own = Halves(a, b, [aov for aov in group.aovs if aov.name not in shared])
-            corrected = correct_aovs(
-                rest.clamp(min=0), frame, AovSum(group.name, own, group.remainder, colors), denoise
-            )
-            images = corrected.images
-            found.facts[group.name] = {
-                "noisy": max(group.closing, default=0.0),
-                "gap": corrected.gap,
-                "left": corrected.closing,
-            }
-            found.lines.append(
-                f"AOVs: {group.name}: missed the picture by {100 * corrected.gap:.2g} %, which was divided among them; "
-                f"now within {corrected.closing:.1e}"
-            )
-        else:
-            images = {name: correct_alone(frame, name, halves[name], denoise) for name in halves}
-        done |= images
-        for aov in group.aovs:
-            if aov.name in group.wanted and aov.name in images:
-                found.channels.update(planes_of(a, b, aov, images[aov.name].numpy(), pass_through=pass_through))
-    if origin.plan.alpha:
-        found.channels[origin.plan.alpha] = _alpha(a, b, origin.plan.alpha, frame, denoise)
-    return found
-
-
-def _alpha(a: exr.ExrFile, b: exr.ExrFile, name: str, frame: Frame, denoise: Denoise) -> Any:
-    first, second = (np.repeat(file.pixels(name).astype(np.float32)[:, :, None], 3, -1) for file in (a, b))
-    image = correct_alone(frame, "alpha", (first, second), denoise)
-    return image.mean(-1).clamp(0, 1).numpy().astype(a.pixels(name).dtype)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ ORDER = (
     {"stages"},
     {"guard", "independence", "metrics"},
     {"correct", "candidates", "history", "aovs"},
+    {"aov_channels"},
     {"files", "facts"},
     {"shot", "tradeoff", "report"},
     {"cli"},

@@ -10,6 +10,7 @@ import torch
 
 import denoisers
 from selfcorrect import facts, files, stages
+from selfcorrect.aov_channels import correct_channels
 from selfcorrect.aovs import denoiser_of
 from selfcorrect.candidates import with_candidates
 from selfcorrect.cli import flags
@@ -159,9 +160,12 @@ class Runner:
         assert self._denoise is not None  # checked before the frame was read
         start = time.perf_counter()
         denoise = denoiser_of(frame, self._denoise)
-        found = files.correct_aovs_of(origin, result.image, frame, denoise, pass_through=self._options.pass_through)
+        a, b = origin.reopened()
+        assert b is not None  # there would be no plan
+        through = self._options.pass_through
+        found = correct_channels((a, b), origin.plan, result.image, frame, denoise, pass_through=through)
         log(*found.lines, f"AOVs: {time.perf_counter() - start:.1f} s")
-        return found.channels, {"aovs": found.facts}
+        return found.planes, {"aovs": found.facts}
 
     def prepare(self, loaded: files.Loaded, began: float) -> Prepared:
         """Read what stages need beyond the halves, denoise where that is to be done, and tell of it."""

@@ -66,6 +66,27 @@ def test_two_decompositions_of_arnold_both_sum(tmp_path: Path, dtype: type) -> N
     assert told["other_channels"] == {"mean": 1, "kept": 1, "corrected": 21, "lacking": []}
 
 
+def test_sets_that_share_an_aov_both_sum(tmp_path: Path) -> None:
+    """Lobes as a whole beside the same in two parts: emission is in both sets."""
+    halves = []
+    for half, seed in (("a", 1), ("b", 2)):
+        generator = np.random.default_rng(seed)
+        channels = {}
+        for letter in "RGB":
+            direct, indirect, emission = generator.random((3, *SIZE), dtype=np.float32)
+            named = {"diffuse_direct": direct, "diffuse_indirect": indirect, "diffuse": direct + indirect}
+            channels |= {f"{name}.{letter}": values for name, values in (named | {"emission": emission}).items()}
+            channels[letter] = direct + indirect + emission
+        halves.append(save(tmp_path / f"{half}.exr", channels))
+    out = tmp_path / "out.exr"
+    result = call("frame", *halves, "-o", out, *FEW, "--aovs", "auto")
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.count("sum to the picture within") == 2
+    for names in (("diffuse_direct", "diffuse_indirect", "emission"), ("diffuse", "emission")):
+        total, picture = sums(out, names)
+        assert np.all(abs(total - picture) <= 1e-5 * picture + 1e-7)
+
+
 def test_blenders_products_sum(tmp_path: Path) -> None:
     """Light is written divided by the colour beside it, in one part per pass as Blender 5 has it."""
     halves = []
