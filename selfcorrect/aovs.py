@@ -21,7 +21,7 @@ Three steps make of them what sums:
 Nothing appears where both halves of a pass are exactly 0 for a pixel and its neighbours, or where its colour is 0, but
 where the picture has light that no pass has: the sum comes first.
 
-Measured with `scripts/bench/aovs.py`; its RESULTS.md has other ways to divide the gap.
+Measured with `scripts/bench/aovs.py`, beside the ratio method and beside denoising each AOV alone.
 """
 
 import math

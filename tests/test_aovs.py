@@ -5,8 +5,8 @@ import itertools
 import pytest
 import torch
 
-from selfcorrect import Frame, SelfcorrectError
-from selfcorrect.aovs import AovSum, correct_alone, correct_aovs, denoiser_of, reconciled
+from selfcorrect import AovSum, Frame, SelfcorrectError, Settings, correct, correct_aovs, denoiser_of
+from selfcorrect.aovs import correct_alone, reconciled
 
 
 def projected(x, v, target):
@@ -137,6 +137,19 @@ def test_a_remainder_takes_part():
     assert list(found.images) == ["aov1"]
     assert found.closing < 1e-6
     assert (found.images["aov1"] <= frame.denoised_full * (1 + 1e-5) + 1e-6).all()
+
+
+def test_aovs_are_named_outputs_of_a_result():
+    _, pairs = rendered()
+    picture = tuple(sum(pair[i] for pair in pairs) for i in (0, 1))
+    frame = Frame(color=picture).denoise(box)
+    result = correct(frame, Settings.preset("fast", steps=1, patch=16, window=3, batch=1))
+    sums = AovSum("these", {f"aov{i}": pair for i, pair in enumerate(pairs)})
+    found = result.with_outputs(correct_aovs(result.image, frame, sums, denoiser_of(frame, box)).images)
+    assert set(found.outputs) == set(result.outputs) | set(sums.halves)
+    assert found.image is result.image
+    total = sum(found.outputs[name].double() for name in sums.halves)
+    assert torch.allclose(total, result.image.double(), rtol=1e-5)
 
 
 def test_the_same_input_gives_the_same_bits():
