@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -59,6 +59,10 @@ class Result:
     def image(self) -> Any:
         """The corrected colour."""
         return self.outputs[COLOR_OUTPUT]
+
+    def with_outputs(self, images: Mapping[str, Any]) -> "Result":
+        """This result with further outputs, such as the AOVs of :func:`selfcorrect.correct_aovs`."""
+        return replace(self, outputs={**self.outputs, **images})
 
     @property
     def maps(self) -> dict[str, Tensor]:

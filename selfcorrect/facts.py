@@ -10,6 +10,7 @@ import torch
 
 from selfcorrect import words
 from selfcorrect.correct import Result
+from selfcorrect.exr.passes import Others
 from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
 from selfcorrect.history import History
@@ -189,12 +190,14 @@ class Written:
     Attributes:
         output: the file.
         clipped: how many values lay beyond the range of half floats.
+        others: what became of the channels beside the colour.
         seconds: of writing, and in total.
         corrected: what was known before.
     """
 
     output: str
     clipped: int
+    others: Others
     seconds: Mapping[str, float]
     corrected: Corrected
 
@@ -208,6 +211,7 @@ class Written:
             "settings": facts.settings.to_dict(),
             **facts.run(),
             "channels": dict(before.channels),
+            "other_channels": self.others._asdict(),
             "seconds": {name: round(value, 3) for name, value in seconds.items()},
             "size": {"width": width, "height": height},
             "repairs": {name: counts._asdict() for name, counts in before.repairs.items()},
@@ -230,6 +234,7 @@ class Written:
         if self.clipped:
             lines.append(f"{self.output}: {self.clipped} values beyond the range of half floats were clipped")
         spent = ", ".join(f"{name} {value:.1f} s" for name, value in self.corrected.seconds.items())
+        lines += self.others.lines()
         lines.append(f"{self.output}: written after {self.seconds['total']:.1f} s ({spent})")
         if estimate is not None:
             lines.append(f"{self.output}: {words.closing(asdict(estimate), self.corrected.place)}")

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +14,23 @@ from selfcorrect import exr
 from selfcorrect.buffers import FEATURES
 from selfcorrect.correct import COLOR_OUTPUT
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
+from selfcorrect.exr.aovs import Plan, plan
 from selfcorrect.exr.limits import check_alike
+from selfcorrect.exr.passes import Others, means, picture
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
 
-__all__ = ["Images", "Loaded", "Origin", "Sources", "load", "load_images", "save", "save_combined"]
+__all__ = [
+    "Images",
+    "Loaded",
+    "Origin",
+    "Saved",
+    "Sources",
+    "load",
+    "load_images",
+    "save",
+    "save_combined",
+]
 
 
 @dataclass(frozen=True)
@@ -32,6 +44,7 @@ class Sources:
         denoised_b: denoised half b.
         denoised_full: denoised mean of both halves.
         mapping: role → channel, for what no table knows.
+        aovs: which AOVs are corrected: None, ``none``, ``auto``, or names (:func:`selfcorrect.exr.aovs.plan`).
     """
 
     a: str
@@ -40,6 +53,7 @@ class Sources:
     denoised_b: str | None = None
     denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
+    aovs: str | None = None
 
     @property
     def inputs(self) -> tuple[str | None, ...]:
@@ -54,17 +68,40 @@ class Sources:
 
 @dataclass(frozen=True)
 class Origin:
-    """The file of half a, whose pixels are not kept: what passes through is read again when it is written.
+    """The files of both halves, whose pixels are not kept: what passes through is read again when it is written.
 
     Attributes:
-        path: the file, with its layer.
+        path: half a's, with its layer.
         taken: role → channel names.
         stamp: what tells whether it has changed since.
+        other: half b's, with its layer.
+        other_stamp: likewise.
+        alike: both halves call the colour the same, so that their other channels can be told apart by name.
+        plan: the AOVs to correct.
     """
 
     path: str
     taken: dict[str, list[str]]
     stamp: tuple[int, int, int]
+    other: str
+    other_stamp: tuple[int, int, int]
+    alike: bool
+    plan: Plan = field(default_factory=Plan)
+
+    def reopened(self) -> tuple[exr.ExrFile, exr.ExrFile | None]:
+        """Half a; and half b, where the halves' other channels can be told apart by name.
+
+        Raises:
+            FileError: a file has changed since it was read.
+        """
+        a = _unchanged(self.path, self.stamp)
+        return a, _unchanged(self.other, self.other_stamp) if self.alike else None
+
+
+def _unchanged(path: str, stamp: tuple[int, int, int]) -> exr.ExrFile:
+    if _stamp(path) != stamp:
+        raise FileError(f"{path}: expected the file that was read, but got one changed since; run again")
+    return exr.read(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +126,7 @@ def load(sources: Sources) -> Loaded:
         FrameError: sizes do not fit.
     """
     _check_distinct(sources)
-    stamp = _stamp(sources.a)
+    stamps = _stamp(sources.a), _stamp(sources.b)
     check_alike(sources.paths)
     half_a, half_b = (_half(path, sources.mapping) for path in (sources.a, sources.b))
     height, width = half_a.buffers["color"].shape[:2]
@@ -123,7 +160,20 @@ def load(sources: Sources) -> Loaded:
         frame = Frame(**pairs)
     except FrameError as error:
         raise FrameError(f"{sources.a} (half a), {sources.b} (half b): {error}") from None
-    return Loaded(frame, Origin(sources.a, taken, stamp))
+    alike = half_a.taken["color"] == half_b.taken["color"]
+    origin = Origin(sources.a, taken, stamps[0], sources.b, stamps[1], alike)
+    return Loaded(frame, replace(origin, plan=_plan(origin, sources.aovs, half_a.taken)))
+
+
+def _plan(origin: Origin, wanted: str | None, taken: Mapping[str, list[str]]) -> Plan:
+    if wanted is None or wanted == "none":
+        return Plan()
+    a, b = origin.reopened()
+    if b is None:
+        raise ChannelError(
+            f"{origin.other}: expected the colour's channels of {origin.path} for --aovs, but got others"
+        )
+    return plan(a, b, taken["color"], wanted, "".join(taken.get("alpha", [])[:1]))
 
 
 class _Half(NamedTuple):
@@ -150,27 +200,51 @@ def _stamp(path: str) -> tuple[int, int, int]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def save(path: str, origin: Origin, outputs: Mapping[str, Any], attributes: Mapping[str, str]) -> int:
-    """Write a frame's outputs with all else of half a.
+class Saved(NamedTuple):
+    """What was written: how many values lay beyond the range of half floats and were clipped, where the file holds
+    those, and what became of the channels beside the colour.
+    """
+
+    clipped: int
+    others: Others
+
+
+def save(
+    path: str,
+    origin: Origin,
+    outputs: Mapping[str, Any],
+    attributes: Mapping[str, str],
+    *,
+    pass_through: bool = False,
+    aovs: Mapping[str, Any] | None = None,
+) -> Saved:
+    """Write a frame's outputs with all else of the halves: what is linear in the samples as the mean of both
+    (:mod:`selfcorrect.exr.passes`), the rest as half a has it, bit by bit.
 
     Args:
         path: the file to write.
-        origin: half a.
-        outputs: images by name; ``color`` takes the place of half a's, any other becomes the channel
+        origin: the halves.
+        outputs: images by name; ``color`` takes the place of the picture, any other becomes the channel
             ``selfcorrect.NAME``.
         attributes: name → text.
-
-    Returns:
-        how many values lay beyond the range of half floats and were clipped, where the file holds those.
+        pass_through: every channel but the picture and the AOVs that were corrected is half a's.
+        aovs: channels of corrected AOVs by their full names.
 
     Raises:
-        FileError: half a has changed since it was read, or the output cannot be written.
+        FileError: a half has changed since it was read, or the output cannot be written.
     """
-    if _stamp(origin.path) != origin.stamp:
-        raise FileError(f"{origin.path}: expected the file that was read, but got one changed since; run again")
-    file = exr.read(origin.path)
+    a, b = origin.reopened()
+    shown = picture(a.channel_names, origin.taken["color"])
+    corrected, planes = dict(aovs or {}), dict[str, Any]()
+    others = Others(0, len(a.channel_names) - len(shown) - len(corrected))
+    if b is not None and not pass_through:
+        planes, others = means(a, b, but={*shown, *corrected})
+    del b
+    planes |= corrected
+    others = others._replace(corrected=len(corrected))
     extra = {f"selfcorrect.{name}": image for name, image in outputs.items() if name != COLOR_OUTPUT}
-    return exr.write(path, file, outputs[COLOR_OUTPUT], origin.taken["color"], attributes, extra=extra)
+    clipped = exr.write(path, a, outputs[COLOR_OUTPUT], shown, attributes, extra=extra, planes=planes)
+    return Saved(clipped, others)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 from importlib.metadata import version
 
 from selfcorrect import Settings, facts
+from selfcorrect.exr.passes import Others
 from selfcorrect.guard import Estimate
 from selfcorrect.image.repair import Repairs
 from selfcorrect.stages.stage import Start
@@ -34,7 +35,7 @@ CORRECTED = facts.Corrected(
     place="mostly in the highlights",
     more={"frame": 3},
 )
-WRITTEN = facts.Written("out.exr", 4, {"write": 0.01, "total": 2.0}, CORRECTED)
+WRITTEN = facts.Written("out.exr", 4, Others(3, 2), {"write": 0.01, "total": 2.0}, CORRECTED)
 RUN = {
     "preset": "fast",
     "denoiser": "box",
@@ -59,6 +60,7 @@ def test_json() -> None:
         ("settings", Settings(seed=7).to_dict()),
         *RUN.items(),
         ("channels", {"color": ["R", "G", "B"], "depth": ["dd.T"]}),
+        ("other_channels", {"mean": 3, "kept": 2, "corrected": 0, "lacking": []}),
         ("seconds", {"read": 0.123, "denoise": 0.5, "train": 1.0, "infer": 0.25, "write": 0.01, "total": 2.0}),
         ("size", {"width": 30, "height": 24}),
         ("repairs", {"color": {"non_finite": 3, "negative": 1}, "depth": {"non_finite": 0, "negative": 0}}),
@@ -82,6 +84,7 @@ def test_log() -> None:
     ]
     assert WRITTEN.lines() == [
         "out.exr: 4 values beyond the range of half floats were clipped",
+        "other channels: 3 the mean of both halves, 2 as in half a",
         "out.exr: written after 2.0 s (train 1.0 s, infer 0.2 s)",
         "out.exr: error about 25 % lower, mostly in the highlights (relMSE ≈ 0.02 → 0.015, -25 ± 3 %)",
     ]

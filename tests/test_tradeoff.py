@@ -251,7 +251,7 @@ class TestCommand:
             (["--csv", "out.txt"], "name ends in .csv"),
             (["--plot", "out.jpg"], "name ends in .png"),
             (["--no-guard"], "--no-guard"),
-            (["--aov", "blend"], "--aov"),
+            (["--diagnostics", "blend"], "--diagnostics"),
         ],
     )
     def test_wrong_input_is_refused_in_one_line(

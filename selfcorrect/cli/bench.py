@@ -49,8 +49,8 @@ def add(commands: Any) -> None:
 
 def _bench(options: argparse.Namespace) -> None:
     halves.check(options)
-    if options.aov:
-        raise SettingsError("expected no --aov with bench, which writes no image, but got one")
+    if options.diagnostics:
+        raise SettingsError("expected no --diagnostics with bench, which writes no image, but got one")
     if options.guard is False:
         raise SettingsError("expected the guard, whose estimate bench compares, but got --no-guard")
     runner = Runner(options, given=options.denoised_a is not None and options.previous is None)

@@ -6,7 +6,7 @@ from typing import Any
 
 from selfcorrect import exr, metrics
 from selfcorrect.cli.compare_shot import compare_shot
-from selfcorrect.cli.terminal import answer
+from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import FrameError
 
 __all__ = ["add"]
@@ -33,7 +33,10 @@ def _compare(options: argparse.Namespace) -> None:
     if options.shot:
         compare_shot(options)
         return
-    image, reference = (exr.load_half(path).buffers["color"] for path in (options.image, options.reference))
+    image, shown = exr.load_picture(options.image)
+    half = exr.load_half(options.reference)
+    reference, taken = half.buffers["color"], half.taken["color"]
+    log(f"{options.image}: {', '.join(shown)}", f"{options.reference}: {', '.join(taken)}")
     reference_b, weight = (
         None if path is None else exr.load_half(path).buffers["color"] for path in (options.reference_b, options.weight)
     )
@@ -43,7 +46,8 @@ def _compare(options: argparse.Namespace) -> None:
         raise FrameError(f"{options.image}: {error}") from None
     if options.json:
         # JSON has no infinity (the PSNR of equal images) and no NaN (the standard error of one tile)
-        answer({name: value if math.isfinite(value) else None for name, value in vars(result).items()})
+        values = {name: value if math.isfinite(value) else None for name, value in vars(result).items()}
+        answer({**values, "channels": {"image": shown, "reference": taken}})
         return
     print(f"relMSE               {result.relmse:.6g} ± {result.relmse_standard_error:.2g}")
     print(f"PSNR (tone-mapped)   {result.psnr:.2f} dB")

@@ -15,6 +15,7 @@ from selfcorrect.stages import STAGES
 from selfcorrect.stages.stage import Extra
 
 __all__ = [
+    "add_aovs",
     "add_extra",
     "add_preset",
     "add_run_flags",
@@ -24,6 +25,17 @@ __all__ = [
     "mapping",
     "settings_of",
 ]
+
+
+def add_aovs(parser: argparse.ArgumentParser) -> None:
+    """The AOVs to correct."""
+    parser.add_argument(
+        "--aovs",
+        default="none",
+        metavar="auto|NAME,NAME|none",
+        help="correct these AOVs so that they sum to the corrected picture; auto: every set of light passes or light "
+        "groups that sums to it in the render; alpha among the names: also that",
+    )
 
 
 def add_extra(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +52,18 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads, by default all")
     parser.add_argument("--map", action="append", default=[], metavar="ROLE=CHANNEL", help="albedo=MyAlbedo, …")
     parser.add_argument(
-        "--aov", type=_aov_names, default=[], metavar="error,blend", help="also write what the guard found, as channels"
+        "--diagnostics",
+        type=_diagnostics,
+        default=[],
+        metavar="error,blend",
+        help="also write what the guard found, as channels",
+    )
+    parser.add_argument("--aov", dest="diagnostics", type=_diagnostics, help=argparse.SUPPRESS)  # its name of old
+    parser.add_argument(
+        "--pass-through",
+        action="store_true",
+        help="keep every channel but the picture as half a has it; by default those that are linear in the samples "
+        "become the mean of both halves",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     add_settings(parser)
@@ -163,8 +186,10 @@ def _destination(extra: Extra) -> str:
     return extra.flag.removeprefix("--").replace("-", "_")
 
 
-def _aov_names(text: str) -> list[str]:
+def _diagnostics(text: str) -> list[str]:
     names = text.split(",")
     if not set(names) <= {"error", "blend"}:
-        raise SettingsError(f"expected --aov error, blend or both, but got {text!r}")
+        raise SettingsError(
+            f"expected --diagnostics error, blend or both, but got {text!r}; AOVs of the file are --aovs"
+        )
     return names

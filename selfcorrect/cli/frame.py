@@ -29,13 +29,16 @@ def add(commands: Any) -> None:
         "left, with the same result; other denoisers are not held to it",
     )
     pages.add_flag(parser)
+    flags.add_aovs(parser)
     flags.add_run_flags(parser)
     parser.set_defaults(run=_frame)
 
 
 def _frame(options: argparse.Namespace) -> None:
     halves.check(options, "output")
-    sources = files.Sources(options.a, options.b, **flags.denoised(options), mapping=flags.mapping(options))
+    sources = files.Sources(
+        options.a, options.b, **flags.denoised(options), mapping=flags.mapping(options), aovs=options.aovs
+    )
     page = pages.FramePage.at(options.report)
     gather = None if page is None else page.gather
     written = correct_files(options, sources, options.output, maxmem=options.maxmem, gather=gather)

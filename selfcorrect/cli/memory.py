@@ -40,6 +40,7 @@ class Needs(NamedTuple):
     read: float
     denoise: float
     correct: float
+    aovs: float
     write: float
 
 
@@ -111,13 +112,23 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
     beyond = extra * image
     further = _CANDIDATES if settings.guard and settings.candidates != "none" else 0
     candidates = 3 * image * further  # of both halves and of their mean
+    stored_channels = sum(len(part.channels) for part in parts)
     evidence = pixels * 8 * (1 + further + (1 + further) * (2 + further) // 2) if settings.guard else 0
     return Needs(
         read=_BASE + half + held + max(stored, half) + beyond,
         denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * beyond + candidates,
         correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * beyond + candidates,
-        write=_BASE + _WORK + 2 * image + held + max(stored, held),
+        aovs=_of_aovs(pixels, stored_channels, half, held) if sources.aovs not in (None, "none") else 0.0,
+        write=_BASE + _WORK + 2 * image + 2 * held + max(stored, held),  # both halves, and what is made of them
     )
+
+
+def _of_aovs(pixels: int, count: int, half: float, held: float) -> float:
+    """At most every channel is of an AOV, each of which is kept as a whole and as half floats of both halves."""
+    image = pixels * _RGB
+    kept = 2 * image * (count / 3)
+    working = 12 * image  # denoised halves and their mean, the gaps and sums, the guides of each, one AOV's evidence
+    return _BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
 
 
 def _features(sources: Sources, parts: list[Header], layer: str | None) -> dict[str, int]:

@@ -24,7 +24,9 @@ def add(commands: Any) -> None:
     """Add the command to argparse's subparsers."""
     parser = commands.add_parser("report", help="a page to look at a corrected frame, for any browser")
     halves.add(parser, alone=False)
-    parser.add_argument("corrected", metavar="OUT.exr", help="what `selfcorrect frame` wrote; with --aov, it has maps")
+    parser.add_argument(
+        "corrected", metavar="OUT.exr", help="what `selfcorrect frame` wrote; with --diagnostics, it has maps"
+    )
     parser.add_argument("-o", "--output", required=True, metavar="PAGE.html", help="the page")
     parser.add_argument("--reference", metavar="REF.exr", help="a reference to look at and to measure against")
     parser.add_argument("--denoiser", metavar="NAME", help="who denoises again; by default who did it for OUT.exr")
@@ -48,7 +50,7 @@ def _report(options: argparse.Namespace) -> None:
     names = {name: f"selfcorrect.{name}" for name in pages.MAPS}
     maps = {name: out.file.pixels(c) for name, c in names.items() if c in out.file.channel_names}
     if not maps:
-        log(f"{options.corrected}: no maps of error and blend weight; `frame --aov error,blend` writes them")
+        log(f"{options.corrected}: no maps of error and blend weight; `frame --diagnostics error,blend` writes them")
     facts |= {
         "title": Path(options.corrected.partition("::")[0]).name,
         "size": {"width": size[1], "height": size[0]},

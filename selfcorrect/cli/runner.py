@@ -10,6 +10,8 @@ import torch
 
 import denoisers
 from selfcorrect import facts, files, stages
+from selfcorrect.aov_channels import correct_channels
+from selfcorrect.aovs import denoiser_of
 from selfcorrect.candidates import with_candidates
 from selfcorrect.cli import flags
 from selfcorrect.cli.terminal import Progress, log
@@ -53,6 +55,7 @@ class Corrected:
     Attributes:
         origin: its half a.
         outputs: the images to write, by name.
+        aovs: channels of corrected AOVs, by their full names.
         network: for the next frame to start from.
         facts: what is known of it.
         began: when the work on it began, by ``time.perf_counter``.
@@ -60,6 +63,7 @@ class Corrected:
 
     origin: files.Origin
     outputs: Mapping[str, Any]
+    aovs: Mapping[str, Any]
     network: Network | None
     facts: facts.Corrected
     began: float
@@ -79,11 +83,14 @@ class Runner:
 
     def __init__(self, options: argparse.Namespace, *, given: bool, scratch: int | None = None):
         self.settings = flags.settings_of(options)
-        if options.aov and not self.settings.guard:
-            aov = ",".join(options.aov)
-            raise SettingsError(f"expected the guard with --aov {aov}, but got settings that turn it off")
+        if options.diagnostics and not self.settings.guard:
+            named = ",".join(options.diagnostics)
+            raise SettingsError(f"expected the guard with --diagnostics {named}, but got settings that turn it off")
         self._stages = stages.opened(self.settings)
         self._extra_files = flags.extra_files(options, self.settings)
+        wanted = getattr(options, "aovs", None) or "none"
+        if wanted != "none" and given and options.denoiser is None:
+            raise SettingsError(f"expected --denoiser NAME with --aovs {wanted}, which are denoised too, but got none")
         if given and options.denoiser is None:
             self._check_denoiser(" which have to be denoised too,")
         _use_machine(options)
@@ -159,8 +166,24 @@ class Runner:
             )
         if gather is not None:
             gather(frame, result)
-        corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, more)
-        return Corrected(origin, _outputs(result, self._options.aov), result.network, corrected, began)
+        aovs, about = self._aovs(origin, frame, result)
+        corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, {**(more or {}), **about})
+        outputs = _outputs(result, self._options.diagnostics)
+        return Corrected(origin, outputs, aovs, result.network, corrected, began)
+
+    def _aovs(self, origin: files.Origin, frame: Frame, result: Result) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Channels of the AOVs that the user wants corrected, and what is to be told of them."""
+        if not origin.plan.written:
+            return {}, {}
+        assert self._denoise is not None  # checked before the frame was read
+        start = time.perf_counter()
+        denoise = denoiser_of(frame, self._denoise)
+        a, b = origin.reopened()
+        assert b is not None  # there would be no plan
+        through = self._options.pass_through
+        found = correct_channels((a, b), origin.plan, result.image, frame, denoise, pass_through=through)
+        log(*found.lines, f"AOVs: {time.perf_counter() - start:.1f} s")
+        return found.planes, {"aovs": found.facts}
 
     def denoise(self, loaded: files.Loaded, began: float | None = None, *, keep_aids: bool = False) -> Denoised:
         """Read what stages need beyond the halves, and denoise where that is to be done.
@@ -177,6 +200,8 @@ class Runner:
             for name, paths in self._extra_files.items()
         }
         seconds = {"read": time.perf_counter() - began}
+        if loaded.origin.plan.written and self._denoise is None:
+            raise SettingsError("expected --denoiser NAME with --aovs, which are denoised too, but got none")
         denoiser = "given"
         if frame.denoised is None or self._options.denoiser is not None:  # who is named beats files found beside
             denoiser, start = self.denoiser, time.perf_counter()
@@ -196,6 +221,8 @@ class Runner:
         if known.channels != self._told:  # of a shot, only where it changes
             log(*facts.channel_lines(known.channels))
         self._told = dict(known.channels)
+        for line in denoised.origin.plan.lines:
+            log(line)
         for doubt in doubts(frame):
             log(f"warning: {doubt}")
         if known.denoiser != "given":
@@ -209,11 +236,17 @@ class Runner:
     def write(self, output: str, corrected: Corrected) -> facts.Written:
         """Write a frame, and tell of it."""
         start = time.perf_counter()
-        clipped = files.save(output, corrected.origin, corrected.outputs, corrected.facts.attributes())
-        now = time.perf_counter()
-        written = facts.Written(
-            output, clipped, {"write": now - start, "total": now - corrected.began}, corrected.facts
+        saved = files.save(
+            output,
+            corrected.origin,
+            corrected.outputs,
+            corrected.facts.attributes(),
+            pass_through=self._options.pass_through,
+            aovs=corrected.aovs,
         )
+        now = time.perf_counter()
+        seconds = {"write": now - start, "total": now - corrected.began}
+        written = facts.Written(output, saved.clipped, saved.others, seconds, corrected.facts)
         log(*written.lines())  # in one piece: another frame may be in work meanwhile
         return written
 
@@ -237,9 +270,9 @@ def _extra(stage: str) -> Extra:
     return extra
 
 
-def _outputs(result: Result, aov: list[str]) -> dict[str, Any]:
-    """The corrected colour, and the maps that --aov asks for."""
-    maps = {name: image.cpu().numpy() for name, image in result.maps.items() if name.partition(".")[0] in aov}
+def _outputs(result: Result, diagnostics: list[str]) -> dict[str, Any]:
+    """The corrected colour, and the maps that --diagnostics asks for."""
+    maps = {name: image.cpu().numpy() for name, image in result.maps.items() if name.partition(".")[0] in diagnostics}
     return {COLOR_OUTPUT: result.image, **maps}
 
 

@@ -40,6 +40,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--fail-fast", action="store_true", help="end with the first frame that fails")
     pages.add_flag(parser)
+    flags.add_aovs(parser)
     flags.add_run_flags(parser)
     parser.set_defaults(run=_sequence)
 
@@ -54,13 +55,19 @@ def _sequence(options: argparse.Namespace) -> int:
         frames=frames,
         **flags.denoised(options),
         mapping=flags.mapping(options),
+        aovs=options.aovs,
     )
     page = pages.ShotPage.at(options.report, frames)
     runner = Runner(options, given=options.denoised_a is not None)
     around = _Around(runner)
     how = shot.Options(
         runner.settings,
-        {"denoiser": runner.denoiser, "aov": options.aov},
+        {
+            "denoiser": runner.denoiser,
+            "diagnostics": options.diagnostics,
+            "pass through": options.pass_through,
+            "aovs": options.aovs,
+        },
         skip_existing=options.skip_existing,
         cold=options.cold,
         warm_start=None if options.warm_start is None else _given(options.warm_start, runner.settings),

@@ -2,7 +2,7 @@
 
 from selfcorrect.exr.file import ExrFile, read
 from selfcorrect.exr.inspection import Inspection, inspect
-from selfcorrect.exr.load import HalfFile, load_half
+from selfcorrect.exr.load import HalfFile, load_half, load_picture
 from selfcorrect.exr.write import check_target, write
 
-__all__ = ["ExrFile", "HalfFile", "Inspection", "check_target", "inspect", "load_half", "read", "write"]
+__all__ = ["ExrFile", "HalfFile", "Inspection", "check_target", "inspect", "load_half", "load_picture", "read", "write"]

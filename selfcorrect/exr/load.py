@@ -13,8 +13,9 @@ from selfcorrect.errors import FrameError
 from selfcorrect.exr import channels
 from selfcorrect.exr.file import ExrFile, Pixels, float_type, read
 from selfcorrect.exr.header import Window
+from selfcorrect.exr.passes import picture
 
-__all__ = ["HalfFile", "load_half"]
+__all__ = ["HalfFile", "load_half", "load_picture"]
 
 _FEATURES = {feature.name for feature in FEATURES}
 
@@ -34,6 +35,22 @@ class HalfFile:
     file: ExrFile
     buffers: dict[str, NDArray[np.floating[Any]]]
     taken: dict[str, list[str]]
+
+
+def load_picture(path: str | Path) -> tuple[NDArray[np.floating[Any]], list[str]]:
+    """Read what people look at: the channels that an output's colour is written to, and their names.
+
+    They are the colour's, but where a file has a picture beside its noisy image, that; a layer that names a pass is
+    that pass.
+
+    Raises:
+        FileError, ChannelError: as for :func:`load_half`.
+    """
+    file = read(path)
+    color = channels.choose(file.channel_names, file=file.path, layer=file.layer)["color"]
+    named = file.layer is not None and color[0].rpartition(".")[0].casefold() == file.layer.casefold()
+    shown = color if named else picture(file.channel_names, color)
+    return _stacked([file.pixels(name) for name in shown], half=False), list(shown)
 
 
 def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None) -> HalfFile:

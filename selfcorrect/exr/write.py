@@ -40,6 +40,7 @@ def write(
     names: Sequence[str],
     attributes: Mapping[str, str],
     extra: Mapping[str, Pixels] | None = None,
+    planes: Mapping[str, Pixels] | None = None,
 ) -> int:
     """Write what a file holds with another colour; everything else passes through bit by bit.
 
@@ -55,6 +56,7 @@ def write(
             Unicode in the text (bytes of a file name) is escaped.
         extra: channel name → (height, width) array, stored in the colour's part, in place of a channel of
             that name if there is one; float64 becomes float32.
+        planes: full name → (height, width) array, in place of other channels of the file, stored in their types.
 
     Returns:
         How many values were beyond the range of half (±65504) and were clipped to it.
@@ -67,11 +69,14 @@ def write(
     target = check_target(path)
     contents = [dict(part.channels) for part in source.parts]
     clipped = 0
-    for name, values in zip(names, np.moveaxis(np.asarray(color), -1, 0), strict=True):
+    replaced = dict(zip(names, np.moveaxis(np.asarray(color), -1, 0), strict=True))
+    for name, values in {**(planes or {}), **replaced}.items():
         index, channel = source.place(name)
         dtype = float_type(source, name)
         _same_size(source, name, values, contents[index][channel])
-        if dtype == np.float16:
+        if values.dtype == dtype:
+            contents[index][channel] = values
+        elif dtype == np.float16:
             clipped += int(np.count_nonzero(np.abs(values) > _HALF_MAX))
             contents[index][channel] = np.clip(values, -_HALF_MAX, _HALF_MAX).astype(dtype)
         else:

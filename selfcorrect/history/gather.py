@@ -16,7 +16,8 @@ from selfcorrect.image.exposure import scale_to_one
 
 __all__ = ["averaged", "gathered"]
 
-# What a fetched pixel may differ in: the best of a few on two frames of one shot; `scripts/bench/shot.py` measures the rest.
+# What a fetched pixel may differ in: the best of a few on two frames of one shot; `scripts/bench/shot.py` measures what
+# comes of them.
 _WIDTHS = {"albedo": 0.2, "normal": 0.5}
 _RADIANCE = 0.6  # of the denoised radiance's size, where noisy halves are gathered
 _CLEANER = 0.3  # the same for the denoised images themselves, which differ less where they show the same

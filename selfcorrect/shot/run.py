@@ -40,6 +40,7 @@ class Shot:
         denoised_b: denoised half b.
         denoised_full: denoised mean of both halves.
         mapping: role → channel.
+        aovs: which AOVs are corrected.
     """
 
     a: str
@@ -50,6 +51,7 @@ class Shot:
     denoised_b: str | None = None
     denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
+    aovs: str | None = None
 
     def sources(self, frame: int) -> files.Sources:
         """The files of one frame.
@@ -68,6 +70,7 @@ class Shot:
             denoised_b=filled(self.denoised_b),
             denoised_full=filled(self.denoised_full),
             mapping=self.mapping,
+            aovs=self.aovs,
         )
 
     def target(self, frame: int) -> str:

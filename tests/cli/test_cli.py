@@ -45,8 +45,13 @@ def test_frame_writes_a_corrected_image_and_passes_the_rest_through(halves: tupl
     assert "color: R, G, B" in result.stderr
     before, after = exr.read(str(halves[0])), exr.read(str(out))
     assert after.channel_names == before.channel_names
+    other = exr.read(str(halves[1]))
     for name in set(before.channel_names) - {"R", "G", "B"}:
-        np.testing.assert_array_equal(after.pixels(name), before.pixels(name))
+        kept = before.pixels(name)
+        mean = ((kept.astype(float) + other.pixels(name)) / 2).astype(kept.dtype)
+        np.testing.assert_array_equal(after.pixels(name), mean if name[0] in "Aa" else kept)
+    assert report["other_channels"] == {"mean": 4, "kept": 4, "corrected": 0, "lacking": []}
+    assert "other channels: 4 the mean of both halves, 4 as in half a" in result.stderr
     assert not np.array_equal(after.pixels("R"), before.pixels("R"))
     header = after.parts[0].header
     assert header["owner"] == "a renderer"
@@ -83,7 +88,7 @@ def test_repairs_are_counted_in_the_log(tmp_path: Path) -> None:
 
 def test_estimate_and_its_maps(halves: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "out.exr"
-    result = call("frame", *halves, "-o", out, *BALANCED, "--aov", "error,blend", "--json")
+    result = call("frame", *halves, "-o", out, *BALANCED, "--diagnostics", "error,blend", "--json")
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     assert report["preset"] == Settings.default()
@@ -210,8 +215,8 @@ class TestBadInput:
             (["--map", "albedo"], "ROLE=CHANNEL"),
             (["--map", "albedo=Nonsense"], "Nonsense"),
             (["--map", "nonsense=R"], "nonsense"),
-            (["--aov", "nonsense"], "nonsense"),
-            (["--aov", "blend"], "guard"),
+            (["--diagnostics", "nonsense"], "nonsense"),
+            (["--diagnostics", "blend"], "guard"),
             (["--denoised-a", "none.exr"], "both denoised halves"),
         ],
     )

@@ -4,6 +4,7 @@ import json
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,14 @@ def test_the_command_takes_no_more_than_is_told(tmp_path: Path) -> None:
     peak = int(result.stdout) * 1024
     told = max(needs(frame, settings))
     assert 0.4 * told < peak < told
+
+
+def test_aovs_are_counted(tmp_path: Path) -> None:
+    frame, settings = sources(tmp_path, SIZE), Settings.preset("balanced", candidates="none")
+    without, named = needs(frame, settings), needs(replace(frame, aovs="auto"), settings)
+    assert without.aovs == 0
+    assert named.aovs > without.read
+    assert named._replace(aovs=0) == without
 
 
 def eight_k(folder: Path, dtype: type) -> Sources:

@@ -19,7 +19,10 @@ Halves = tuple[Path, Path]
 def out(halves: Halves, tmp_path: Path) -> Path:
     """The halves, corrected, with the guard's maps."""
     assert (
-        cli.main(["frame", *map(str, halves), "-o", str(tmp_path / "out.exr"), *BALANCED, "--aov", "error,blend"]) == 0
+        cli.main(
+            ["frame", *map(str, halves), "-o", str(tmp_path / "out.exr"), *BALANCED, "--diagnostics", "error,blend"]
+        )
+        == 0
     )
     return tmp_path / "out.exr"
 
@@ -52,7 +55,9 @@ def test_page_from_files(halves: Halves, out: Path, tmp_path: Path) -> None:
 
 def test_both_ways_show_the_same_images(halves: Halves, tmp_path: Path) -> None:
     first, second, out = (tmp_path / name for name in ("first.html", "second.html", "out.exr"))
-    assert run("frame", *halves, "-o", out, *BALANCED, "--aov", "error,blend", "--report", first).returncode == 0
+    assert (
+        run("frame", *halves, "-o", out, *BALANCED, "--diagnostics", "error,blend", "--report", first).returncode == 0
+    )
     assert run("report", *halves, out, "-o", second, "--threads", 1).returncode == 0
     for one, two in zip(*(data_of(page.read_text())["layers"] for page in (first, second)), strict=True):
         assert one["name"] == two["name"]

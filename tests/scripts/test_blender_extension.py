@@ -102,7 +102,7 @@ def test_without_selfcorrect_it_says_how_to_install_it(found: dict[str, Any]) ->
     assert f"selfcorrect is not installed; run in a terminal: {INSTALL}" in found["missing"]
     assert {"selfcorrect is not installed", f"In a terminal: {INSTALL}", "Preferences"} <= set(found["missing panel"])
     assert "Frame" not in found["missing panel"]
-    assert {"samples", "output", "denoiser", "preset", "Frame", "Animation"} <= set(found["panel"])
+    assert {"samples", "output", "denoiser", "preset", "aovs", "Frame", "Animation"} <= set(found["panel"])
 
 
 @pytest.mark.blender

@@ -52,6 +52,9 @@ class SelfcorrectSettings(bpy.types.PropertyGroup):
         name="Denoiser", description="oidn, joint-bilateral, …; empty takes the best that is installed"
     )
     preset: bpy.props.StringProperty(name="Preset", description="balanced, paper, …; empty takes the default")
+    aovs: bpy.props.BoolProperty(
+        name="Light Passes", description="Correct light passes and light groups too, so that they sum to the picture"
+    )
 
 
 def preferences(context):
@@ -187,7 +190,7 @@ class SELFCORRECT_PT_panel(bpy.types.Panel):
             box.label(text="Or name the program in the preferences:")
             box.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = __package__
             return
-        for name in ("samples", "output", "denoiser", "preset"):
+        for name in ("samples", "output", "denoiser", "preset", "aovs"):
             layout.prop(settings, name)
         row = layout.row(align=True)
         row.operator("selfcorrect.render", text="Frame", icon="RENDER_STILL").animation = False

@@ -69,6 +69,7 @@ def plan(scene: bpy.types.Scene, command: str | None, frames: range, scratch: Pa
         correct = [command, "sequence", a, b, "-o", corrected, f"--frames={shot}"]
     correct += ["--denoiser", own.denoiser] if own.denoiser else []
     correct += ["--preset", own.preset] if own.preset else []
+    correct += ["--aovs", "auto"] if own.aovs else []
     render = [*_blender(copy), "--scene-name", scene.name, *flags]
     return Job(
         [
