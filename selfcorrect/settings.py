@@ -161,7 +161,8 @@ class Settings:
     frame_radius: int = _setting(
         0,
         "of a shot: how many frames on either side give their samples to the candidate history; 0 takes none",
-        "not in the paper; scripts/bench/shot.py measures it",
+        _WARM,
+        everyday=True,
     )
     time_budget: float = _setting(
         0.0,

@@ -58,7 +58,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         metavar="error,blend",
         help="also write what the guard found, as channels",
     )
-    parser.add_argument("--aov", dest="diagnostics", type=_diagnostics, help=argparse.SUPPRESS)  # its name of old
+    parser.add_argument("--aov", dest="diagnostics", type=_diagnostics, help=Expert("the old name of --diagnostics"))
     parser.add_argument(
         "--pass-through",
         action="store_true",
