@@ -5,8 +5,9 @@ import math
 from typing import Any
 
 from selfcorrect import exr, metrics
-from selfcorrect.cli.terminal import answer
-from selfcorrect.errors import FrameError
+from selfcorrect.cli.terminal import answer, show
+from selfcorrect.errors import FrameError, SettingsError
+from selfcorrect.exr.limits import check_alike
 
 __all__ = ["add"]
 
@@ -24,6 +25,9 @@ def add(commands: Any) -> None:
 
 
 def _compare(options: argparse.Namespace) -> None:
+    if not -(2**63) <= options.seed < 2**63:
+        raise SettingsError(f"expected a --seed of 64 bits, but got {options.seed}")
+    check_alike([path for path in (options.image, options.reference, options.reference_b, options.weight) if path])
     image, reference = (exr.load_half(path).buffers["color"] for path in (options.image, options.reference))
     reference_b, weight = (
         None if path is None else exr.load_half(path).buffers["color"] for path in (options.reference_b, options.weight)
@@ -36,8 +40,10 @@ def _compare(options: argparse.Namespace) -> None:
         # JSON has no infinity (the PSNR of equal images) and no NaN (the standard error of one tile)
         answer({name: value if math.isfinite(value) else None for name, value in vars(result).items()})
         return
-    print(f"relMSE               {result.relmse:.6g} ± {result.relmse_standard_error:.2g}")
-    print(f"PSNR (tone-mapped)   {result.psnr:.2f} dB")
-    print(f"SSIM (tone-mapped)   {result.ssim:.4f}")
-    print(f"FLIP                 {result.flip:.4f}")
-    print(f"mean radiance ratio  {result.mean_radiance_ratio:.4f}")
+    show(
+        f"relMSE               {result.relmse:.6g} ± {result.relmse_standard_error:.2g}",
+        f"PSNR (tone-mapped)   {result.psnr:.2f} dB",
+        f"SSIM (tone-mapped)   {result.ssim:.4f}",
+        f"FLIP                 {result.flip:.4f}",
+        f"mean radiance ratio  {result.mean_radiance_ratio:.4f}",
+    )

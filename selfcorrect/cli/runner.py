@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 import denoisers
+from denoisers import check_threads
 from selfcorrect import facts, files, stages
 from selfcorrect.candidates import with_candidates
 from selfcorrect.cli import flags
@@ -213,8 +214,7 @@ def _outputs(result: Result, aov: list[str]) -> dict[str, Any]:
 
 def _use_machine(options: argparse.Namespace) -> None:
     if options.threads is not None:
-        if options.threads < 1:
-            raise SettingsError(f"expected --threads of at least 1, but got {options.threads}")
+        check_threads(options.threads)
         torch.set_num_threads(options.threads)
     try:
         torch.zeros(1, device=options.device, dtype=torch.float64).cpu()  # the guard's; MPS has none

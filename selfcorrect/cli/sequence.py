@@ -7,7 +7,7 @@ from typing import Any
 from selfcorrect.cli import flags, pages
 from selfcorrect.cli.runner import Runner
 from selfcorrect.cli.terminal import answer, log
-from selfcorrect.errors import FrameError
+from selfcorrect.errors import FileError, FrameError
 from selfcorrect.settings import Settings
 from selfcorrect.shot import run as shot
 from selfcorrect.shot.framerange import parse_frames
@@ -80,7 +80,10 @@ def _sequence(options: argparse.Namespace) -> int:
             told = {"output": outcome.output, "reason": outcome.reason}
             if outcome.report is not None:
                 told = outcome.report.to_dict()
-            answer({"frame": outcome.frame, "outcome": outcome.kind, **told})
+            try:
+                answer({"frame": outcome.frame, "outcome": outcome.kind, **told})
+            except FileError as error:  # the frames count, not what is told of them
+                log(f"selfcorrect: {error}")
 
     try:
         failed = shot.run(work, how, one, report, log)

@@ -157,7 +157,7 @@ def _refusal(headers: Sequence[tuple[Part, Mapping[str, Any]]]) -> str | None:
 
 def _disordered(part: Part) -> bool:
     """Whether a part of scan lines has the line order that only tiles may have."""
-    return part.header["type"] == OpenEXR.scanlineimage and part.header.get("lineOrder") == OpenEXR.RANDOM_Y
+    return bool(part.header["type"] == OpenEXR.scanlineimage and part.header.get("lineOrder") == OpenEXR.RANDOM_Y)
 
 
 def _attributes(part: Part) -> dict[str, Any]:
@@ -193,6 +193,19 @@ def check_target(path: str | Path, suffix: str = ".exr") -> Path:
         raise FileError(f"{path}: expected a folder at {target.parent}, but got none; create it first")
     if not os.access(target.parent, os.W_OK):
         raise FileError(f"{path}: expected a folder to write to, but {target.parent} is read-only; choose another")
+    if os.path.exists(target) and not os.path.isfile(target):
+        raise FileError(f"{path}: expected a file to write, but got a pipe or a device; choose another")
+    _check_name(path, target)
     if os.path.exists(target) and not os.access(target, os.W_OK):
         raise FileError(f"{path}: expected a file to overwrite, but got a read-only one; choose another")
     return target
+
+
+def _check_name(path: str | Path, target: Path) -> None:
+    """Refuse a name that the file system does not take."""
+    try:
+        os.lstat(target)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise FileError(f"{path}: expected a name for the output, but got: {error.strerror}; choose another") from None
