@@ -315,8 +315,8 @@ def worker(seed: int, first: int) -> Iterator["subprocess.Popen[bytes]"]:
 
 
 def mutants(seed: int, seconds: float, most: int) -> Iterator[tuple[int, Found]]:
-    """Number and fate of mutants until the time is up."""
-    end, number = time.monotonic() + seconds, 0
+    """Number and fate of mutants until the time is up, counted from the first one's."""
+    end, number = float("inf"), 0
     while number < most and time.monotonic() < end:
         with worker(seed, number) as process:
             assert process.stdout is not None
@@ -331,6 +331,7 @@ def mutants(seed: int, seconds: float, most: int) -> Iterator[tuple[int, Found]]
                     found = Found(command, damage, "crash", f"signal {-process.wait()}")
                 else:
                     found = Found(command, damage, "hang", f"longer than {LIMIT:.0f} s")
+                end = min(end, time.monotonic() + seconds)
                 yield number, found
                 number, started = number + 1, 0.0
                 if not line:

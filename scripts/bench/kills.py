@@ -1,6 +1,6 @@
 """Kills and interrupts at random moments of a shot: an output is whole or not there, and the next run goes on.
 
-    python scripts/bench/kills.py           # 100 SIGKILLs, then 100 times SIGINT
+    python scripts/bench/kills.py           # 100 SIGKILLs and 100 SIGINTs in turn; --seconds ends it sooner
 
 Each child is forked from a process that has imported everything, so that the moments fall into the work: reading,
 training, writing, publishing. One shot is corrected over and over: after each kill the outputs that are there must be
@@ -112,6 +112,7 @@ def resumed(folder: Path) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=100)
+    parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     draw = random.Random(options.seed)
@@ -125,10 +126,15 @@ def main() -> int:
         ended(child(folder), 120.0)
         whole = time.monotonic() - start
         print(f"a run takes {whole:.2f} s; signals come after 0 to {whole:.2f} s", flush=True)
-        for sent in (signal.SIGKILL, signal.SIGINT):
-            counts = Counter(trial(folder, sent, draw.uniform(0.0, whole)) for _ in range(options.times))
-            print(f"{sent.name}: {dict(counts)}", flush=True)
-            bad += options.times - counts["whole"]
+        counts: Counter[tuple[str, str]] = Counter()
+        for _ in range(options.times):
+            for sent in (signal.SIGKILL, signal.SIGINT):
+                counts[sent.name, trial(folder, sent, draw.uniform(0.0, whole))] += 1
+            if time.monotonic() - start > options.seconds:
+                break
+    for (sent_name, outcome), count in sorted(counts.items()):
+        print(f"{sent_name}: {count} {outcome}")
+        bad += count * (outcome != "whole")
     return int(bad > 0)
 
 

@@ -10,8 +10,8 @@ import pytest
 
 def test_half_a_minute_of_damaged_files() -> None:
     found = [one for _, one in fuzz.mutants(seed=7, seconds=30, most=10**9)]
+    assert found
     assert [one for one in found if one.outcome not in fuzz.GOOD] == []
-    assert {one.outcome for one in found} == set(fuzz.GOOD)
 
 
 def test_a_mutant_is_always_the_same(tmp_path: Path) -> None:
