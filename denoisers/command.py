@@ -112,7 +112,7 @@ class Command:
                 start_new_session=True,
             )
         except OSError as error:
-            raise DenoiserError(f"{self.name}: {error.strerror}") from error
+            raise DenoiserError(f"{self.name}: expected a program to run, but got: {error.strerror}") from error
         try:
             _, told = process.communicate()
         except BaseException:

@@ -99,7 +99,7 @@ def load_state(path: str | Path) -> State:
     checksum = metadata.pop("checksum", "")
     try:
         if checksum != _checksum(tensors, metadata):
-            raise FileError("the checksum of another state: it is damaged")
+            raise ValueError("the checksum of another state: it is damaged")
         network = _network(_traits(metadata["traits"]), tensors)
         frame = json.loads(metadata["frame"])
         return State(network, None if frame is None else int(frame), metadata["recipe"])
