@@ -132,5 +132,5 @@ def _validate(guides: Guides, raw: Tensor, corners: Tensor, window: Window) -> N
     last = corners + torch.tensor([raw.shape[2] - bottom, raw.shape[3] - guides.width])
     if corners.numel() and (corners.min() < -reach or last.max() > reach):
         raise FrameError(
-            f"expected patches at most {reach} pixels outside the image, but got one beyond; the margin is {guides.margin}"
+            f"expected patches at most {reach} pixels outside the image, but got one beyond (margin {guides.margin})"
         )
