@@ -79,14 +79,18 @@ def create(spec: str, *, threads: int | None = None, scratch: int | None = None)
     return Denoise(_plugin(spec, threads, scratch))
 
 
-def check_threads(threads: int) -> None:
+def check_threads(threads: int, name: str = "threads") -> None:
     """Refuse a number of threads that no machine has: the libraries below end the process over it.
+
+    Args:
+        threads: how many.
+        name: what messages call the number.
 
     Raises:
         SettingsError: it is less than 1 or more than 1024.
     """
     if not 1 <= threads <= _MOST_THREADS:
-        raise SettingsError(f"expected threads from 1 to {_MOST_THREADS}, but got {threads}")
+        raise SettingsError(f"expected {name} from 1 to {_MOST_THREADS}, but got {threads}")
 
 
 def _plugin(spec: str, threads: int | None, scratch: int | None) -> Plugin | DualPlugin:

@@ -214,7 +214,7 @@ def _outputs(result: Result, aov: list[str]) -> dict[str, Any]:
 
 def _use_machine(options: argparse.Namespace) -> None:
     if options.threads is not None:
-        check_threads(options.threads)
+        check_threads(options.threads, "--threads")
         torch.set_num_threads(options.threads)
     try:
         torch.zeros(1, device=options.device, dtype=torch.float64).cpu()  # the guard's; MPS has none
