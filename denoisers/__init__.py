@@ -16,10 +16,12 @@ from types import ModuleType
 from denoisers.host import Denoise, DualPlugin, Plugin
 from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
-__all__ = ["PACKAGED", "Denoise", "DualPlugin", "Plugin", "create", "default", "names", "variants"]
+__all__ = ["PACKAGED", "Denoise", "DualPlugin", "Plugin", "check_threads", "create", "default", "names", "variants"]
 
 PACKAGED = Path(__file__).resolve().parent / "weights" / "denoiser.onnx"
 """The project's own model: ``onnx`` without a path."""
+
+_MOST_THREADS = 1024
 
 
 def names() -> tuple[str, ...]:
@@ -70,11 +72,25 @@ def create(spec: str, *, threads: int | None = None, scratch: int | None = None)
         DenoiserError: the specification is unknown, or the model, the command or the class does not fit.
         FileError: the model or the Python file is missing.
         MissingPackageError: the denoiser needs an optional package; the message says what to run.
-        SettingsError: ``threads`` is less than 1.
+        SettingsError: ``threads`` is out of range.
     """
-    if threads is not None and threads < 1:
-        raise SettingsError(f"threads: expected at least 1, but got {threads}")
+    if threads is not None:
+        check_threads(threads)
     return Denoise(_plugin(spec, threads, scratch))
+
+
+def check_threads(threads: int, name: str = "threads") -> None:
+    """Refuse a number of threads that no machine has: the libraries below end the process over it.
+
+    Args:
+        threads: how many.
+        name: what messages call the number.
+
+    Raises:
+        SettingsError: it is less than 1 or more than 1024.
+    """
+    if not 1 <= threads <= _MOST_THREADS:
+        raise SettingsError(f"expected {name} from 1 to {_MOST_THREADS}, but got {threads}")
 
 
 def _plugin(spec: str, threads: int | None, scratch: int | None) -> Plugin | DualPlugin:

@@ -17,10 +17,14 @@ that begins with ``-``) is left out too. So both ``--albedo={albedo}`` and ``--a
 whole; a switch that takes no value must not stand directly before a bare ``{albedo}`` or ``{normal}``.
 """
 
+import contextlib
+import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -64,29 +68,59 @@ class Command:
         """Write the images, run the program, read its output (H, W, 3).
 
         Raises:
-            DenoiserError: the program cannot be run or exits with another code than 0 (the message ends
-                with the last line of its stderr), or its output is missing, unreadable or of another size.
+            DenoiserError: there is no room for the files; the program cannot be run, or exits with another code
+                than 0 (the message ends with the last line of its stderr); or its output is missing, unreadable or of
+                another size.
         """
         images = {"color": color, "albedo": albedo, "normal": normal}
-        with tempfile.TemporaryDirectory(prefix="denoiser-") as folder:
+        with self._folder() as folder:
             paths = {"output": Path(folder, "output.exr")}
             for name, image in images.items():
                 if image is not None:
                     paths[name] = Path(folder, f"{name}.exr")
-                    _write(paths[name], image)
+                    self._write(paths[name], image)
             self._run(_arguments(self.template, paths))
             return self._read(paths["output"], (color.shape[0], color.shape[1]))
 
-    def _run(self, arguments: list[str]) -> None:
+    def _folder(self) -> "tempfile.TemporaryDirectory[str]":
         try:
-            done = subprocess.run(
-                arguments, stdin=subprocess.DEVNULL, capture_output=True, check=False, errors="replace"
+            return tempfile.TemporaryDirectory(prefix="denoiser-", ignore_cleanup_errors=True)
+        except OSError as error:
+            raise DenoiserError(
+                f"{self.name}: expected a temporary folder, but got: {error.strerror}; set TMPDIR to one with room"
+            ) from error
+
+    def _write(self, path: Path, image: torch.Tensor) -> None:
+        """Write an image (H, W, 3) as float32 R, G, B."""
+        try:
+            _write(path, image)
+        except (OSError, RuntimeError) as error:  # what OpenEXR raises where the disk is full
+            raise DenoiserError(
+                f"{self.name}: expected room for {path.name} in {path.parent}, but got: "
+                f"{' '.join(str(error).split())}; set TMPDIR to a folder with room"
+            ) from error
+
+    def _run(self, arguments: list[str]) -> None:
+        """Run the program, and end it with all that it has started where this process is told to end."""
+        try:
+            process = subprocess.Popen(
+                arguments,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                errors="replace",
+                start_new_session=True,
             )
         except OSError as error:
-            raise DenoiserError(f"{self.name}: {error.strerror}") from error
-        if done.returncode != 0:
-            said = done.stderr.strip().splitlines()[-1:] or ["it printed nothing to stderr"]
-            raise DenoiserError(f"{self.name}: expected exit code 0, but got {done.returncode}: {said[0]}")
+            raise DenoiserError(f"{self.name}: expected a program to run, but got: {error.strerror}") from error
+        try:
+            _, told = process.communicate()
+        except BaseException:
+            _end(process)
+            raise
+        if process.returncode != 0:
+            said = told.strip().splitlines()[-1:] or ["it printed nothing to stderr"]
+            raise DenoiserError(f"{self.name}: expected exit code 0, but got {process.returncode}: {said[0]}")
 
     def _read(self, path: Path, size: tuple[int, int]) -> torch.Tensor:
         expected = f"{self.name}: expected {{output}} as an EXR of {size[1]}x{size[0]} with R, G, B, but got"
@@ -104,6 +138,16 @@ class Command:
             if plane.shape != size:
                 raise DenoiserError(f"{expected} {'x'.join(map(str, reversed(plane.shape)))}")
         return torch.from_numpy(np.stack(planes, axis=2).astype(np.float32))
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    """End a process and those that it has started."""
+    if sys.platform == "win32":
+        process.kill()
+    else:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def _arguments(template: list[str], paths: dict[str, Path]) -> list[str]:

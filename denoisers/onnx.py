@@ -148,9 +148,9 @@ class Onnx:
 
     def _multiple(self) -> int:
         text = self.session.get_modelmeta().custom_metadata_map.get("multiple", "1")
-        if not (text.isascii() and text.isdigit() and int(text) > 0):
+        if not (text.isascii() and text.isdigit() and len(text) < 5 and int(text) > 0):
             raise DenoiserError(
-                f"{self.path}: expected the metadata multiple to be an integer from 1, but got {text!r}"
+                f"{self.path}: expected the metadata multiple to be an integer from 1 to 9999, but got {text[:40]!r}"
             )
         return int(text)
 

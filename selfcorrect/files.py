@@ -128,7 +128,7 @@ def load(sources: Sources) -> Loaded:
     _check_distinct(sources)
     stamps = _stamp(sources.a), _stamp(sources.b)
     check_alike(sources.paths)
-    half_a, half_b = (_half(path, sources.mapping) for path in (sources.a, sources.b))
+    half_a, half_b = _half(sources.a, sources.mapping, passes=True), _half(sources.b, sources.mapping)
     height, width = half_a.buffers["color"].shape[:2]
     if half_b.buffers["color"].shape[:2] != (height, width):
         other = half_b.buffers["color"].shape
@@ -184,8 +184,11 @@ class _Half(NamedTuple):
     window: tuple[int, ...]  # of the colour's data
 
 
-def _half(path: str, mapping: Mapping[str, str] | None = None) -> _Half:
+def _half(path: str, mapping: Mapping[str, str] | None = None, *, passes: bool = False) -> _Half:
+    """A half; ``passes``: its other channels and its attributes are to be written again."""
     half = exr.load_half(path, mapping=mapping)
+    if passes:
+        exr.check_source(half.file)
     used = {role: torch.from_numpy(buffer) for role, buffer in half.buffers.items() if role != "alpha"}
     window = half.file.parts[half.file.place(half.taken["color"][0])[0]].data_window
     return _Half(used, half.taken, tuple(window))
@@ -281,6 +284,7 @@ def load_images(paths: Sequence[str]) -> Images:
     _check_different(paths)
     check_alike(paths)
     first = exr.load_half(paths[0])
+    exr.check_source(first.file)
     size = first.buffers["color"].shape[:2]
     colors = [first.buffers["color"], *(_color_of(path, size) for path in paths[1:])]
     return Images(tuple(repaired(color, path) for color, path in zip(colors, paths, strict=True)), first)

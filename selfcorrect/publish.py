@@ -10,6 +10,7 @@ import contextlib
 import os
 import re
 import secrets
+import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -36,6 +37,7 @@ def publish(target: Path, data: bytes | bytearray | memoryview) -> None:
     temporary = None
     try:
         with _created(target) as (temporary, stream):
+            _keep_mode(stream, target)
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
@@ -51,6 +53,13 @@ def publish(target: Path, data: bytes | bytearray | memoryview) -> None:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def _keep_mode(stream: BinaryIO, target: Path) -> None:
+    """Who may read and write an existing file may do so when it is overwritten."""
+    if sys.platform != "win32":
+        with contextlib.suppress(OSError):
+            os.fchmod(stream.fileno(), stat.S_IMODE(os.stat(target).st_mode))
 
 
 @contextlib.contextmanager

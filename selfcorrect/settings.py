@@ -1,5 +1,6 @@
 """One settings object. The command's flags are its fields; every default names its source."""
 
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Self
@@ -12,6 +13,9 @@ _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench/quality.py measures it"
 _WARM = "not in the paper; scripts/bench/shot.py measures it"
 _TRAINED = "the package's own are trained by scripts/train"
+_MOST = 2**31 - 1
+"""Of whole numbers: what every counter below holds."""
+
 _STAGES = "not in the paper; scripts/bench/stages.py measures it"
 
 
@@ -23,10 +27,13 @@ def _setting(
     choices: tuple[str, ...] = (),
     least: float = 0,
     unit: str = "",
+    most: float | None = None,
     everyday: bool = False,
 ) -> Any:
     """A field with what the command's flag and the range check need; ``everyday``: no expert's, short help lists it."""
-    metadata = {"help": help_, "source": source, "choices": choices, "least": least, "unit": unit, "everyday": everyday}
+    most = most or (_MOST if isinstance(default, int) else sys.float_info.max)
+    metadata = {"help": help_, "source": source, "choices": choices, "least": least, "most": most, "unit": unit}
+    metadata["everyday"] = everyday
     return field(default=default, metadata=metadata)
 
 
@@ -61,8 +68,9 @@ def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) ->
         raise SettingsError(f"expected {expected} for the setting {name}, but got {value!r}")
     if kind is str and metadata["choices"] and value not in metadata["choices"]:
         raise SettingsError(f"expected {name} out of {', '.join(metadata['choices'])}, but got {value!r}")
-    if isinstance(value, (int, float)) and not metadata["least"] <= value < float("inf"):
-        raise SettingsError(f"expected {name} of at least {metadata['least']}, but got {value!r}")
+    if isinstance(value, (int, float)) and not metadata["least"] <= value <= metadata["most"]:
+        bound = f"at most {metadata['most']}" if value > metadata["most"] else f"at least {metadata['least']}"
+        raise SettingsError(f"expected {name} of {bound}, but got {value!r}")
 
 
 STAGE_NAMES = ("regression", "core", "james-stein", "neural-james-stein", "deep-combiner", "deep-combiner-4")
@@ -103,17 +111,17 @@ class Settings:
     )
     window: int = _setting(19, "side of the cross-bilateral window, odd, at most 31", f"{_PAPER}, Sec. 4", least=1)
     taps_every: int = _setting(1, "in training, take one in so many of the window's pixels", _OURS, least=1)
-    filters: int = _setting(16, "filters of each hidden convolution", f"{_PAPER}, Sec. 4", least=1)
-    layers: int = _setting(9, "3x3 convolutions", f"{_PAPER}, Sec. 4", least=2)
+    filters: int = _setting(16, "filters of each hidden convolution", f"{_PAPER}, Sec. 4", least=1, most=4096)
+    layers: int = _setting(9, "3x3 convolutions", f"{_PAPER}, Sec. 4", least=2, most=256)
     precision: str = _setting(
         "fp32",
         "of the convolutions: fp32, or bf16 where the processor has matrix tiles",
         f"{_PAPER}, published code",
         choices=("fp32", "bf16"),
     )
-    patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1)
+    patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1, most=65536)
     stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
-    batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1)
+    batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1, most=65536)
     epochs: int = _setting(20, "passes over all patches", f"{_PAPER}, Sec. 4", least=0)
     steps: int = _setting(0, "optimiser steps on patches drawn at random; 0 counts epochs", _OURS)
     visits: int = _setting(
@@ -171,7 +179,9 @@ class Settings:
         unit="s",
         everyday=True,
     )
-    seed: int = _setting(0, "of the network's first weights and the order of the patches", "any number will do")
+    seed: int = _setting(
+        0, "of the network's first weights and the order of the patches", "any number will do", most=2**63 - 1
+    )
 
     def __post_init__(self) -> None:
         for f in fields(self):

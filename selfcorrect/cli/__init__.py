@@ -5,7 +5,7 @@ from importlib.metadata import version
 
 from selfcorrect.cli import bench, combine, compare, completion, demo, frame, inspect, report, sequence, settings
 from selfcorrect.cli.help import Parser
-from selfcorrect.cli.terminal import log
+from selfcorrect.cli.terminal import log, terminable
 from selfcorrect.errors import SelfcorrectError, out_of_memory
 from selfcorrect.exr.file import one_line
 
@@ -18,7 +18,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code is 0, 1 where frames of a shot failed, 2 for input that the user can fix."""
     try:
         options = _parser().parse_args(arguments)
-        failed: int | None = options.run(options)
+        with terminable():
+            failed: int | None = options.run(options)
     except SelfcorrectError as error:
         log(f"selfcorrect: error: {error}")
         return 2
@@ -26,6 +27,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not out_of_memory(error):
             raise
         log(f"selfcorrect: error: expected enough memory for this frame, but got: {one_line(error)}; see --maxmem")
+        return 2
+    except OSError as error:
+        named = f"{error.filename}: " if error.filename else ""
+        log(f"selfcorrect: error: {named}expected a file to work with, but got: {error.strerror or one_line(error)}")
         return 2
     except KeyboardInterrupt:
         log("selfcorrect: interrupted; what was not finished is not written")

@@ -10,7 +10,7 @@ from typing import Any
 from selfcorrect import exr, files, report, tradeoff
 from selfcorrect.cli import flags, halves, pages
 from selfcorrect.cli.runner import Runner
-from selfcorrect.cli.terminal import answer, log
+from selfcorrect.cli.terminal import answer, log, show
 from selfcorrect.errors import SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.publish import publish
@@ -124,14 +124,14 @@ def _answer(options: argparse.Namespace, found: dict[str, Any], measured: list[M
         answer(found)
         return
     front, chosen = tradeoff.pareto_front(measured), tradeoff.recommended(measured)
-    print(f"{'point':24} {'train':>8} {'infer':>8} {'seconds':>8}  {_ERROR}; * on the Pareto front")
+    show(f"{'point':24} {'train':>8} {'infer':>8} {'seconds':>8}  {_ERROR}; * on the Pareto front")
     for m in measured:
         mark = " *" if m in front else ""
-        print(
+        show(
             f"{m.point.name:24} {m.train:8.2f} {m.infer:8.2f} {m.seconds:8.2f}  "
             f"{m.ratio:.3f} ± {m.standard_error:.3f}{mark}"
         )
-    print(_recommendation(measured, chosen), flush=True)
+    show(_recommendation(measured, chosen))
 
 
 def _recommendation(measured: list[Measurement], chosen: Measurement | None) -> str:

@@ -6,8 +6,9 @@ from typing import Any
 
 from selfcorrect import exr, metrics
 from selfcorrect.cli.compare_shot import compare_shot
-from selfcorrect.cli.terminal import answer, log
-from selfcorrect.errors import FrameError
+from selfcorrect.cli.terminal import answer, log, show
+from selfcorrect.errors import FrameError, SettingsError
+from selfcorrect.exr.limits import check_alike
 
 __all__ = ["add"]
 
@@ -30,9 +31,12 @@ def add(commands: Any) -> None:
 
 
 def _compare(options: argparse.Namespace) -> None:
+    if not -(2**63) <= options.seed < 2**63:
+        raise SettingsError(f"expected a --seed of 64 bits, but got {options.seed}")
     if options.shot:
         compare_shot(options)
         return
+    check_alike([path for path in (options.image, options.reference, options.reference_b, options.weight) if path])
     image, shown = exr.load_picture(options.image)
     half = exr.load_half(options.reference)
     reference, taken = half.buffers["color"], half.taken["color"]
@@ -49,8 +53,10 @@ def _compare(options: argparse.Namespace) -> None:
         values = {name: value if math.isfinite(value) else None for name, value in vars(result).items()}
         answer({**values, "channels": {"image": shown, "reference": taken}})
         return
-    print(f"relMSE               {result.relmse:.6g} ± {result.relmse_standard_error:.2g}")
-    print(f"PSNR (tone-mapped)   {result.psnr:.2f} dB")
-    print(f"SSIM (tone-mapped)   {result.ssim:.4f}")
-    print(f"FLIP                 {result.flip:.4f}")
-    print(f"mean radiance ratio  {result.mean_radiance_ratio:.4f}")
+    show(
+        f"relMSE               {result.relmse:.6g} ± {result.relmse_standard_error:.2g}",
+        f"PSNR (tone-mapped)   {result.psnr:.2f} dB",
+        f"SSIM (tone-mapped)   {result.ssim:.4f}",
+        f"FLIP                 {result.flip:.4f}",
+        f"mean radiance ratio  {result.mean_radiance_ratio:.4f}",
+    )

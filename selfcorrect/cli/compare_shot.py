@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from selfcorrect import exr, metrics
-from selfcorrect.cli.terminal import answer
+from selfcorrect.cli.terminal import answer, show
 from selfcorrect.errors import FileError, FrameError
+from selfcorrect.exr.limits import check_alike
 from selfcorrect.history.motion import available, between, warped
 from selfcorrect.shot.framerange import fill, there
 
@@ -32,14 +33,14 @@ def compare_shot(options: argparse.Namespace) -> None:
             row |= _change(frame, previous)
         rows.append(row)
         if not options.json:
-            print("  ".join(f"{name.replace('_', ' ')} {_figure(value)}" for name, value in row.items()))
+            show("  ".join(f"{name.replace('_', ' ')} {_figure(value)}" for name, value in row.items()))
         previous = frame
     names = [name for name in rows[-1] if name != "frame"]
     means = {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
     if options.json:
         answer({"frames": rows, "mean": means})
     else:
-        print("mean   " + "  ".join(f"{name.replace('_', ' ')} {_figure(value)}" for name, value in means.items()))
+        show("mean   " + "  ".join(f"{name.replace('_', ' ')} {_figure(value)}" for name, value in means.items()))
 
 
 def _frames(options: argparse.Namespace) -> Iterator[_Frame]:
@@ -47,9 +48,11 @@ def _frames(options: argparse.Namespace) -> Iterator[_Frame]:
     if not numbers:
         raise FileError(f"{options.image}: expected the frames of a shot, but got no such file")
     for number in numbers:
+        given = (options.image, options.reference, options.reference_b, options.weight)
+        paths = [None if name is None else fill(name, number) for name in given]
+        check_alike([path for path in paths if path])
         image, a, b, weight = (
-            None if name is None else torch.from_numpy(exr.load_half(fill(name, number)).buffers["color"])
-            for name in (options.image, options.reference, options.reference_b, options.weight)
+            None if path is None else torch.from_numpy(exr.load_half(path).buffers["color"]) for path in paths
         )
         assert image is not None
         assert a is not None

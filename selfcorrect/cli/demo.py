@@ -9,7 +9,7 @@ from typing import Any
 from selfcorrect import exr, files, metrics
 from selfcorrect.cli import flags
 from selfcorrect.cli.frame import correct_files
-from selfcorrect.cli.terminal import answer
+from selfcorrect.cli.terminal import answer, show
 from selfcorrect.frame import Frame
 
 __all__ = ["add"]
@@ -32,9 +32,9 @@ def _demo(options: argparse.Namespace) -> None:
         answer(report)
         return
     for name, error in report["relmse"].items():
-        print(f"{name:10} relMSE {error:.5f}   mean radiance {report['mean'][name]:.4f} of the reference")
+        show(f"{name:10} relMSE {error:.5f}   mean radiance {report['mean'][name]:.4f} of the reference")
     change = report["relmse"]["corrected"] / report["relmse"]["denoised"] - 1
-    print(f"corrected against denoised: {change:+.0%}" + (f"; image in {folder}" if options.output else ""))
+    show(f"corrected against denoised: {change:+.0%}" + (f"; image in {folder}" if options.output else ""))
 
 
 def _report(options: argparse.Namespace, data: Path, folder: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from selfcorrect.files import Sources
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.patches import crops
 
-__all__ = ["Needs", "fits", "needs", "parse_size", "scratch_within"]
+__all__ = ["Needs", "check_held", "fits", "needs", "parse_size", "scratch_within"]
 
 GIB = 2**30
 _BASE = 0.35 * GIB  # the interpreter, torch, the OpenEXR library and OIDN's weights
@@ -50,7 +50,7 @@ def parse_size(text: str) -> int:
     >>> parse_size("1.5G") // 2**20
     1536
     """
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    found = re.fullmatch(r"(\d{1,18}(?:\.\d{1,18})?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
     if found is None:
         raise SettingsError(f"expected a size such as 6G or 800M, but got {text!r}")
     return int(float(found[1]) * _UNITS[found[2].upper()])
@@ -101,7 +101,7 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
     parts, stored = headers(file)
     height, width = parts[0].data_window.size
     pixels = height * width
-    held = max(map(stored_bytes, sources.paths))
+    held = max(map(_with_siblings, sources.paths))
     features = _features(sources, parts, layer or None)
     half = pixels * (_RGB + sum(features.values()))
     image = pixels * _RGB
@@ -129,6 +129,27 @@ def _of_aovs(pixels: int, count: int, half: float, held: float) -> float:
     kept = 2 * image * (count / 3)
     working = 12 * image  # denoised halves and their mean, the gaps and sums, the guides of each, one AOV's evidence
     return _BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
+
+
+def check_held(limit: int, path: str) -> None:
+    """Refuse a file whose pixels do not fit into so many bytes, by its header.
+
+    Raises:
+        FileError: the file is missing or no OpenEXR file.
+        SettingsError: it does not fit.
+    """
+    needed = _BASE + stored_bytes(path)
+    if needed > limit:
+        raise SettingsError(
+            f"{path}: expected --maxmem of at least {math.ceil(10 * needed / GIB) / 10:.1f}G for the pixels that its "
+            f"header claims, but got {limit / GIB:.1f}G"
+        )
+
+
+def _with_siblings(path: str) -> int:
+    """Bytes of a file and of those beside it, which are held together while one half is read."""
+    beside = channels.siblings(path.partition("::")[0]).values()
+    return stored_bytes(path) + sum(stored_bytes(str(file)) for file in beside)
 
 
 def _features(sources: Sources, parts: list[Header], layer: str | None) -> dict[str, int]:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 import denoisers
+from denoisers import check_threads
 from selfcorrect import facts, files, stages
 from selfcorrect.aov_channels import correct_channels
 from selfcorrect.aovs import denoiser_of
@@ -278,8 +279,7 @@ def _outputs(result: Result, diagnostics: list[str]) -> dict[str, Any]:
 
 def _use_machine(options: argparse.Namespace) -> None:
     if options.threads is not None:
-        if options.threads < 1:
-            raise SettingsError(f"expected --threads of at least 1, but got {options.threads}")
+        check_threads(options.threads, "--threads")
         torch.set_num_threads(options.threads)
     try:
         torch.zeros(1, device=options.device, dtype=torch.float64).cpu()  # the guard's; MPS has none

@@ -10,7 +10,7 @@ from selfcorrect import files
 from selfcorrect.cli import flags, pages
 from selfcorrect.cli.runner import Denoised, Runner
 from selfcorrect.cli.terminal import answer, log
-from selfcorrect.errors import FrameError, SelfcorrectError
+from selfcorrect.errors import FileError, FrameError, SelfcorrectError
 from selfcorrect.settings import Settings
 from selfcorrect.shot import run as shot
 from selfcorrect.shot.framerange import parse_frames
@@ -92,7 +92,10 @@ def _sequence(options: argparse.Namespace) -> int:
             told = {"output": outcome.output, "reason": outcome.reason}
             if outcome.report is not None:
                 told = outcome.report.to_dict()
-            answer({"frame": outcome.frame, "outcome": outcome.kind, **told})
+            try:
+                answer({"frame": outcome.frame, "outcome": outcome.kind, **told})
+            except FileError as error:  # the frames count, not what is told of them
+                log(f"selfcorrect: {error}")
 
     try:
         failed = shot.run(work, how, one, report, log)

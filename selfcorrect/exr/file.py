@@ -9,6 +9,7 @@ import contextlib
 import io
 import mmap
 import os
+import stat
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -148,6 +149,7 @@ def headers(file: str) -> tuple[list[header.Header], int]:
         FileError: the file is missing or no OpenEXR file, or its header is not complete.
     """
     try:
+        _check_regular(file)
         with open(file, "rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             if not size:
@@ -201,12 +203,25 @@ def read(path: str | Path) -> ExrFile:
 
 def _bytes(file: str) -> bytes:
     """The whole file, or its first bytes where they show that it is something else, however large."""
+    _check_regular(file)
     with open(file, "rb") as stream:
         start = stream.read(len(header.MAGIC))
         if start != header.MAGIC:
             return start
         stream.seek(0)
         return stream.read()
+
+
+def _check_regular(file: str) -> None:
+    """Refuse what may never end, or never begin: pipes, sockets, devices.
+
+    Raises:
+        FileError: it is one of those.
+        OSError: there is nothing of this name.
+    """
+    mode = os.stat(file).st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise FileError(f"{file}: expected an OpenEXR file, but got a pipe or a device; name a file")
 
 
 def _part(part: Any, header: header.Header) -> Part:

@@ -13,6 +13,8 @@ from selfcorrect.exr.header import Window
 
 __all__ = ["ChannelReport", "Inspection", "PartReport", "inspect"]
 
+_STRIP = 64  # rows
+
 
 @dataclass(frozen=True)
 class ChannelReport:
@@ -122,10 +124,16 @@ def inspect(path: str | Path) -> Inspection:
 
 
 def _report(name: str, pixels: Pixels) -> ChannelReport:
-    finite = pixels[np.isfinite(pixels)].astype(np.float64)
-    nan = int(np.count_nonzero(np.isnan(pixels)))
-    inf = pixels.size - finite.size - nan
-    if not finite.size:
+    """Strip by strip: the copies in double precision stay small beside the pixels."""
+    nan, count, total, low, high = 0, 0, 0.0, np.inf, -np.inf
+    for top in range(0, pixels.shape[0], _STRIP):
+        strip = pixels[top : top + _STRIP]
+        nan += int(np.count_nonzero(np.isnan(strip)))
+        finite = strip[np.isfinite(strip)].astype(np.float64)
+        if finite.size:
+            count, total = count + finite.size, total + float(finite.sum())
+            low, high = min(low, float(finite.min())), max(high, float(finite.max()))
+    inf = pixels.size - count - nan
+    if not count:
         return ChannelReport(name, pixels.dtype.name, nan, inf, None, None, None)
-    span = float(finite.min()), float(finite.max()), float(finite.mean())
-    return ChannelReport(name, pixels.dtype.name, nan, inf, *span)
+    return ChannelReport(name, pixels.dtype.name, nan, inf, low, high, total / count)

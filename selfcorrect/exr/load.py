@@ -1,5 +1,6 @@
 """One half of a frame from its files: colour and whichever G-buffers there are."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from selfcorrect.buffers import FEATURES
 from selfcorrect.errors import FrameError
 from selfcorrect.exr import channels
-from selfcorrect.exr.file import ExrFile, Pixels, float_type, read
+from selfcorrect.exr.file import ExrFile, Pixels, float_type, headers, read
 from selfcorrect.exr.header import Window
 from selfcorrect.exr.passes import picture
 
@@ -71,6 +72,7 @@ def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None) -> 
     sources = {role: (file, names) for role, names in chosen.items()}
     for role, sibling in channels.siblings(file.path).items():
         if role not in sources:
+            _check_size(file, role, str(sibling))
             other = read(sibling)
             sources[role] = other, channels.sibling_channels(other.channel_names, role, file=other.path)
     window = _window(file, chosen["color"][0])
@@ -88,6 +90,16 @@ def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None) -> 
     for name in chosen["color"]:
         float_type(file, name)
     return HalfFile(file, buffers, taken)
+
+
+def _check_size(file: ExrFile, role: str, sibling: str) -> None:
+    """Refuse a file beside the colour by its header where it claims more pixels than the colour has."""
+    height, width = max((part.data_window.size for part in headers(sibling)[0]), key=math.prod)
+    if height * width > math.prod(file.size):
+        raise FrameError(
+            f"{sibling}: expected {file.size[1]}x{file.size[0]} pixels ({role}) like {file.path}, "
+            f"but got {width}x{height}; move it away or render it again"
+        )
 
 
 def _stacked(planes: Sequence[Pixels], *, half: bool) -> NDArray[np.floating[Any]]:

@@ -6,8 +6,11 @@ What the OpenEXR library cannot keep by itself when a file passes through, and w
 - empty vectors and channel lists as attributes: handed over as opaque bytes;
 - the order of attributes and channels: written sorted, which the format leaves to the writer;
 - arrays that are not C-contiguous are written scrambled, without an error: all are made contiguous;
+- a file of scan lines in no order (a line order that only tiles may have): written from the top;
 - a file with DWA or B44 compression would lose precision in every channel once more: it is written with ZIP;
-- mip and rip maps lose all levels but the first: such files are refused (see :mod:`selfcorrect.exr.header`).
+- mip and rip maps lose all levels but the first: such files are refused (see :mod:`selfcorrect.exr.header`);
+- standard attributes of another type can be read but not written: such files are refused before the work
+  (:func:`check_source`).
 
 Sources: https://openexr.com/en/latest/OpenEXRFileLayout.html and trials with OpenEXR 3.5.
 """
@@ -26,11 +29,12 @@ from selfcorrect.exr import header
 from selfcorrect.exr.file import LIBRARY_ERRORS, ExrFile, Part, Pixels, float_type, one_line, quiet
 from selfcorrect.publish import publish
 
-__all__ = ["check_target", "write"]
+__all__ = ["check_source", "check_target", "write"]
 
 _HALF_MAX = 65504.0
 _LOSSY = {"B44_COMPRESSION", "B44A_COMPRESSION", "DWAA_COMPRESSION", "DWAB_COMPRESSION"}
 _REWRITTEN = {"channels", "chunkCount", "compression"}
+_OWN = {"channels", "chunkCount"}  # the library's own account of what it writes
 
 
 def write(
@@ -102,16 +106,13 @@ def _encode(
     parts, kept = [], []
     for index, (part, arrays) in enumerate(zip(source.parts, contents, strict=True)):
         new = added if index == 0 else {}
-        own = {"channels", "chunkCount"}
-        attributes = {name: _writable(name, part) for name in part.header if name not in own}
-        if attributes["compression"].name in _LOSSY:
-            attributes["compression"] = OpenEXR.ZIP_COMPRESSION
         pixels = {
             name: OpenEXR.Channel(name, np.ascontiguousarray(array), 1, 1, name in part.linear)
             for name, array in arrays.items()
         }
-        parts.append(OpenEXR.Part({**attributes, **new}, pixels, part.name))
-        kept.append({k: v for k, v in part.attributes.items() if k not in _REWRITTEN and k not in new})
+        parts.append(OpenEXR.Part({**_attributes(part), **new}, pixels, part.name))
+        rewritten = _REWRITTEN | new.keys() | ({"lineOrder"} if _disordered(part) else set())
+        kept.append({k: v for k, v in part.attributes.items() if k not in rewritten})
     stream = io.BytesIO()
     try:
         with quiet():
@@ -121,6 +122,57 @@ def _encode(
     data = stream.getbuffer()
     header.restore(data, kept, file)
     return data
+
+
+def check_source(source: ExrFile) -> None:
+    """Refuse a file whose attributes could not be written back; to be called before long work.
+
+    Raises:
+        FileError: an attribute cannot be written; the message names the first one.
+    """
+    together = _refusal([(part, _attributes(part)) for part in source.parts])
+    if together is None:
+        return
+    for part in source.parts:
+        for name, value in _attributes(part).items():
+            reason = _refusal([(part, {name: value})])
+            if reason is not None:
+                kind = part.attributes[name].type if name in part.attributes else type(value).__name__
+                raise FileError(
+                    f"{source.path}: expected attributes that can be written back, but got '{name}' of type {kind} "
+                    f"({reason}); remove it or write it anew"
+                )
+    raise FileError(f"{source.path}: expected attributes that can be written back, but got: {together}; write it anew")
+
+
+def _refusal(headers: Sequence[tuple[Part, Mapping[str, Any]]]) -> str | None:
+    """Why the library does not write these attributes around one pixel; None where it does."""
+    pixel = np.zeros(2, np.int32), np.zeros(2, np.int32)
+    parts = [
+        OpenEXR.Part({**attributes, "dataWindow": pixel}, {"Y": np.zeros((1, 1), np.float32)}, part.name)
+        for part, attributes in headers
+    ]
+    try:
+        with quiet():
+            OpenEXR.File(parts).write(io.BytesIO())
+    except LIBRARY_ERRORS as error:
+        return one_line(error)
+    return None
+
+
+def _disordered(part: Part) -> bool:
+    """Whether a part of scan lines has the line order that only tiles may have."""
+    return bool(part.header["type"] == OpenEXR.scanlineimage and part.header.get("lineOrder") == OpenEXR.RANDOM_Y)
+
+
+def _attributes(part: Part) -> dict[str, Any]:
+    """The attributes to write, but for the library's own."""
+    attributes = {name: _writable(name, part) for name in part.header if name not in _OWN}
+    if attributes["compression"].name in _LOSSY:
+        attributes["compression"] = OpenEXR.ZIP_COMPRESSION
+    if _disordered(part):
+        attributes["lineOrder"] = OpenEXR.INCREASING_Y
+    return attributes
 
 
 def _writable(name: str, part: Part) -> Any:
@@ -146,6 +198,19 @@ def check_target(path: str | Path, suffix: str = ".exr") -> Path:
         raise FileError(f"{path}: expected a folder at {target.parent}, but got none; create it first")
     if not os.access(target.parent, os.W_OK):
         raise FileError(f"{path}: expected a folder to write to, but {target.parent} is read-only; choose another")
+    if os.path.exists(target) and not os.path.isfile(target):
+        raise FileError(f"{path}: expected a file to write, but got a pipe or a device; choose another")
+    _check_name(path, target)
     if os.path.exists(target) and not os.access(target, os.W_OK):
         raise FileError(f"{path}: expected a file to overwrite, but got a read-only one; choose another")
     return target
+
+
+def _check_name(path: str | Path, target: Path) -> None:
+    """Refuse a name that the file system does not take."""
+    try:
+        os.lstat(target)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise FileError(f"{path}: expected a name for the output, but got: {error.strerror}; choose another") from None

@@ -7,7 +7,7 @@ from selfcorrect.errors import SettingsError
 
 __all__ = ["fill", "has_frame", "parse_frames", "there"]
 
-_RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?:[x:](\d+))?)?")
+_RANGE = re.compile(r"(-?\d{1,9})(?:-(-?\d{1,9})(?:[x:](\d{1,9}))?)?", re.ASCII)
 _MOST = 1_000_000  # frames; a slip such as 1-10000000 must not fill the memory
 
 

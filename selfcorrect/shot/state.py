@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import get_type_hints
 
 import safetensors
 import safetensors.torch
@@ -81,6 +82,8 @@ def load_state(path: str | Path) -> State:
     Raises:
         FileError: the file is missing, no state of selfcorrect, or damaged.
     """
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise FileError(f"{path}: expected a state of selfcorrect, but got a folder, a pipe or a device; name a file")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata: dict[str, str] = file.metadata() or {}
@@ -94,10 +97,15 @@ def load_state(path: str | Path) -> State:
         got = metadata.get("format", "another safetensors file")
         raise FileError(f"{path}: expected '{_FORMAT}', but got {got!r}; save it again with --save-state")
     checksum = metadata.pop("checksum", "")
-    if checksum != _checksum(tensors, metadata):
-        raise FileError(f"{path}: expected a state with the checksum it was saved with, but got another: it is damaged")
-    network = _network(Traits(**json.loads(metadata["traits"])), tensors)
-    return State(network, json.loads(metadata["frame"]), metadata["recipe"])
+    try:
+        if checksum != _checksum(tensors, metadata):
+            raise ValueError("the checksum of another state: it is damaged")
+        network = _network(_traits(metadata["traits"]), tensors)
+        frame = json.loads(metadata["frame"])
+        return State(network, None if frame is None else int(frame), metadata["recipe"])
+    except (SelfcorrectError, LookupError, TypeError, ValueError, RuntimeError, RecursionError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise FileError(f"{path}: expected a state that fits together, but got: {reason}; save it again") from None
 
 
 def state_after(path: str | Path, frame: int, recipe: str) -> State | None:
@@ -107,6 +115,13 @@ def state_after(path: str | Path, frame: int, recipe: str) -> State | None:
     except SelfcorrectError:  # missing, or of a run that was killed and lost it: there is nothing to go on from
         return None
     return state if (state.frame, state.recipe) == (frame, recipe) else None
+
+
+def _traits(text: str) -> Traits:
+    """Traits from JSON; of each the type that it is annotated with."""
+    found = json.loads(text)
+    kinds = get_type_hints(Traits)
+    return Traits(**{name: kinds[name](value) for name, value in dict(found).items()})
 
 
 def _network(traits: Traits, tensors: dict[str, Tensor]) -> Network:

@@ -103,7 +103,7 @@ def _built(path: str | Path, kind: type[Kind], metadata: Mapping[str, str], tens
     try:
         network = kind(**json.loads(architecture))
         network.load_state_dict(tensors)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, LookupError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise FileError(
             f"{path}: expected weights that fit their architecture {architecture}, but got: {reason}"

@@ -151,3 +151,32 @@ def test_nothing_can_be_told_but_the_picture_is_written(
     monkeypatch.undo()
     for name in ("full", "none"):
         assert np.isfinite(exr.read(str(tmp_path / f"{name}.exr")).pixels("R")).all()
+
+
+def test_inspect_and_compare_judge_headers_before_pixels(
+    halves: tuple[Path, Path], tmp_path: Path, capfd: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bomb = tmp_path / "bomb.exr"
+    bomb.write_bytes(raw(window=(0, 0, 39_999, 49_999))[:4096])
+    monkeypatch.setattr("selfcorrect.exr.inspection.read", lambda _: pytest.fail("pixels were read"))
+    line = refused(capfd, "inspect", bomb)
+    assert "bomb.exr: expected --maxmem of at least 11.6G for the pixels that its header claims" in line
+    assert "expected --maxmem of at least 0.4G" in refused(capfd, "inspect", halves[0], "--maxmem", "100M")
+    monkeypatch.setattr("selfcorrect.exr.load.read", lambda _: pytest.fail("pixels were read"))
+    for more in ([bomb], [halves[1], bomb], [halves[1], "--weight", bomb]):
+        assert "bomb.exr: expected 30x24 pixels like" in refused(capfd, "compare", halves[0], *more)
+
+
+@pytest.mark.parametrize("companion", ["albedo", "denoImg"])
+def test_a_giant_beside_a_half_is_refused_by_its_header(
+    companion: str, halves: tuple[Path, Path], tmp_path: Path, capfd: Captured
+) -> None:
+    for letter, half in zip("AB", halves, strict=True):
+        (tmp_path / f"x_randImg{letter}.exr").write_bytes(raw())
+        assert half.exists()
+    (tmp_path / f"x_{companion}A.exr").write_bytes(raw(window=(0, 0, 11_999, 9_999))[:4096])
+    given = (tmp_path / "x_randImgA.exr", tmp_path / "x_randImgB.exr", "-o", tmp_path / "out.exr", *BALANCED)
+    line = refused(capfd, "frame", *given)
+    assert f"x_{companion}A.exr: expected 14x9 pixels" in line
+    assert "but got 12000x10000" in line
+    assert "expected --maxmem of at least" in refused(capfd, "frame", *given, "--maxmem", "1G")

@@ -277,7 +277,7 @@ class TestSpecifications:
 
     @pytest.mark.parametrize("threads", [0, -1])
     def test_threads_are_checked(self, threads: int) -> None:
-        with pytest.raises(SettingsError, match=f"threads: expected at least 1, but got {threads}"):
+        with pytest.raises(SettingsError, match=f"expected threads from 1 to 1024, but got {threads}"):
             denoisers.create("box", threads=threads)
 
     @pytest.mark.parametrize(

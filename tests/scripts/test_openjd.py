@@ -117,3 +117,22 @@ def test_a_wrong_flag_fails_with_its_line(shot: Path) -> None:
     code, said = run(shot, Frames="1-2", MoreFlags="--stepps 4")
     assert code != 0
     assert re.search(r"openjd_fail: unrecognized arguments: --stepps", said)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [("HalfA", "../away.####.exr"), ("Output", "../x.####.exr"), ("Output", "/tmp/x.####.exr"), ("WarmStart", "../s")],
+)
+def test_names_stay_in_their_folders(shot: Path, parameter: str, value: str) -> None:
+    code, said = run(shot, Frames="1-1", **{parameter: value})
+    assert code != 0
+    (reason,) = re.findall(r"openjd_fail: (.*)", said)
+    assert reason.startswith(f"{parameter}: expected a name inside {shot}")
+    assert "Traceback" not in said
+
+
+def test_an_unbalanced_quote_is_one_line(shot: Path) -> None:
+    code, said = run(shot, Frames="1-1", MoreFlags="--steps '4")
+    assert code != 0
+    assert re.search(r"openjd_fail: MoreFlags: expected flags .* No closing quotation", said)
+    assert "Traceback" not in said

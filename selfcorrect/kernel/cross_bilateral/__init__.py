@@ -131,4 +131,6 @@ def _validate(guides: Guides, raw: Tensor, corners: Tensor, window: Window) -> N
     bottom = (guides.stacked - 1) * guides.pitch + guides.height
     last = corners + torch.tensor([raw.shape[2] - bottom, raw.shape[3] - guides.width])
     if corners.numel() and (corners.min() < -reach or last.max() > reach):
-        raise FrameError(f"expected patches at most {reach} pixels outside the image (margin {guides.margin})")
+        raise FrameError(
+            f"expected patches at most {reach} pixels outside the image, but got one beyond (margin {guides.margin})"
+        )
