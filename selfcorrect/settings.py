@@ -119,7 +119,7 @@ class Settings:
     )
     inference: str = _setting(
         "halves",
-        "denoised image that the result is inferred with: the halves', or the full buffer's where they agree",
+        "the result is the mean of the corrected halves, or full: that and what the denoiser gains from both together",
         f"{_PAPER}, Sec. 4",
         choices=("halves", "full"),
     )

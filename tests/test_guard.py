@@ -7,7 +7,7 @@ from torch import Tensor
 from selfcorrect.guard import Evidence, Guarded, Pair, keep_light_
 from selfcorrect.guard import guard as guard_by_evidence
 from selfcorrect.image import bands
-from selfcorrect.stages.core.trust import trust_in_full
+from selfcorrect.stages.core.transfer import gained_by_both
 
 SIZE = (160, 192)
 
@@ -164,14 +164,13 @@ def test_bands_of_rows_give_what_the_whole_image_gives(improves: bool, monkeypat
 
     def run() -> tuple[Guarded, Tensor, Tensor]:
         guarded = guard(color, denoised, corrected, full, image, scale=0.7)
-        trusted = torch.cat([trust_in_full(denoised, full, rows) for rows in bands.bands(size[0])])
-        return guarded, trusted, keep_light_(0.9 * guarded.image, full, color)
+        return guarded, gained_by_both(denoised, full + 0.01), keep_light_(0.9 * guarded.image, full, color)
 
-    (banded, trusted, lit), _ = run(), monkeypatch.setattr(bands, "_BAND", 1024)
-    whole, trusted_whole, lit_whole = run()
+    (banded, gained, lit), _ = run(), monkeypatch.setattr(bands, "_BAND", 1024)
+    whole, gained_whole, lit_whole = run()
     assert whole.estimate.improved == improves
-    assert trusted_whole.min() < 0.1
-    assert torch.equal(trusted, trusted_whole)
+    assert 0 < gained_whole.min() < gained_whole.max()
+    torch.testing.assert_close(gained, gained_whole, rtol=1e-9, atol=0)
     torch.testing.assert_close(banded.image, whole.image, rtol=2e-7, atol=1e-9)
     torch.testing.assert_close(torch.stack(banded.maps()), torch.stack(whole.maps()), rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(lit, lit_whole, rtol=2e-7, atol=1e-9)

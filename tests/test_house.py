@@ -14,7 +14,7 @@ ORDER = (
     {"image"},
     {"kernel"},
     {"frame", "exr"},
-    {"stages"},
+    {"stages", "pooling"},
     {"guard", "independence", "metrics"},
     {"correct", "candidates", "history"},
     {"files", "facts"},
