@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from selfcorrect.correct import Result
+from selfcorrect.fireflies import Removed
 from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
 from selfcorrect.image.repair import Repairs
@@ -94,6 +95,7 @@ class Corrected:
         preset: the name that the settings came from.
         settings: of the correction, as they were asked for.
         estimate: what the guard says was gained; None where it is off.
+        removed: fireflies that were taken out; None where they are kept.
         start: what training began from.
         seconds: of each stage.
         input_scale: what radiance was multiplied by.
@@ -108,6 +110,7 @@ class Corrected:
     preset: str
     settings: Settings
     estimate: Estimate | None
+    removed: Removed | None
     start: Start
     seconds: Mapping[str, float]
     input_scale: float
@@ -127,6 +130,7 @@ class Corrected:
             preset=preset,
             settings=settings,
             estimate=result.estimate,
+            removed=result.removed,
             start=result.start,
             seconds=dict(result.seconds),
             input_scale=result.input_scale,
@@ -158,6 +162,7 @@ class Corrected:
             "denoiser": self.before.denoiser,
             "version": self.version,
             "estimate": None if self.estimate is None else asdict(self.estimate),
+            "fireflies": None if self.removed is None else self.removed._asdict(),
             "start": self.start._asdict(),
             **self.more,
         }
@@ -205,8 +210,10 @@ class Written:
 
     def lines(self) -> list[str]:
         """For the log: what was gained, what was clipped, and how long it took."""
-        estimate = self.corrected.estimate
+        estimate, removed = self.corrected.estimate, self.corrected.removed
         lines = [] if estimate is None else [str(estimate)]
+        if removed is not None and removed.pixels:
+            lines.append(str(removed))
         if self.clipped:
             lines.append(f"{self.output}: {self.clipped} values beyond the range of half floats were clipped")
         spent = ", ".join(f"{name} {value:.1f} s" for name, value in self.corrected.seconds.items())

@@ -17,8 +17,9 @@ Measured with `scripts/bench/quality.py`; README has the numbers.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -61,6 +62,23 @@ class Estimate:
     standard_error: float
     improved: bool
     independent: bool = True
+
+    def without(self, fireflies: float, uncertain: float) -> Self:
+        """The estimate of an output without fireflies, whose relMSE in the denoised image was this, and how uncertain.
+
+        The guard hardly counts them: their own radiance, by which it weighs, hides them.
+        """
+        denoised = self.denoised + fireflies
+        if denoised == 0:
+            return self
+        left = self.corrected / denoised
+        return replace(
+            self,
+            denoised=denoised,
+            change=left - 1,
+            standard_error=math.hypot(self.standard_error * self.denoised, left * uncertain) / denoised,
+            improved=True,
+        )
 
     def __str__(self) -> str:
         if not self.independent:

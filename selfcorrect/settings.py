@@ -124,6 +124,12 @@ class Settings:
         choices=("halves", "full"),
     )
     guard: bool = _setting(False, "blend with the denoised image as far as the halves confirm it", _OURS)
+    fireflies: str = _setting(
+        "keep",
+        "that the denoiser has left in one half only: remove, within a hundredth of the light, or keep",
+        "not in the paper; scripts/bench/fireflies.py measures it",
+        choices=("remove", "keep"),
+    )
     crossed_weights: bool = _setting(
         False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
@@ -185,6 +191,7 @@ class Settings:
             initialisation="residual",
             inference="full",
             guard=True,
+            fireflies="remove",
             crossed_weights=True,
             precision="bf16",
             candidates="auto",

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 from importlib.metadata import version
 
 from selfcorrect import Settings, facts
+from selfcorrect.fireflies import Removed
 from selfcorrect.guard import Estimate
 from selfcorrect.image.repair import Repairs
 from selfcorrect.stages.stage import Start
@@ -20,11 +21,13 @@ DENOISED = facts.Denoised(
     promises={"oidn:none": 0.25, "oidn:fast": 0.0},
     candidates=("oidn:none",),
 )
+REMOVED = Removed(pixels=0.002, light=0.0015, error=0.25, standard_error=0.125)
 CORRECTED = facts.Corrected(
     before=DENOISED,
     preset="fast",
     settings=Settings(seed=7),
     estimate=ESTIMATE,
+    removed=REMOVED,
     start=Start(warm=True, cold_loss=0.5, warm_loss=0.25),
     seconds={"train": 1.0, "infer": 0.25},
     input_scale=2.0,
@@ -39,6 +42,7 @@ RUN = {
     "denoiser": "box",
     "version": version("selfcorrect"),
     "estimate": asdict(ESTIMATE),
+    "fireflies": {"pixels": 0.002, "light": 0.0015, "error": 0.25, "standard_error": 0.125},
     "start": {"warm": True, "cold_loss": 0.5, "warm_loss": 0.25},
     "frame": 3,
 }
@@ -80,11 +84,13 @@ def test_log() -> None:
     ]
     assert WRITTEN.lines() == [
         "relMSE ≈ 0.02 → 0.015 (-25 ± 3 %)",
+        "fireflies of one half were removed from 0.20% of the pixels, with 0.15% of the light; --fireflies keep leaves "
+        "them",
         "out.exr: 4 values beyond the range of half floats were clipped",
         "out.exr: written after 2.0 s (train 1.0 s, infer 0.2 s)",
     ]
-    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None))
-    assert unguarded.lines() == WRITTEN.lines()[2:]
+    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None, removed=None))
+    assert unguarded.lines() == WRITTEN.lines()[3:]
     assert unguarded.to_dict()["estimate"] is None
 
 

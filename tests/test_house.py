@@ -15,7 +15,7 @@ ORDER = (
     {"kernel"},
     {"frame", "exr"},
     {"stages", "pooling"},
-    {"guard", "independence", "metrics"},
+    {"guard", "fireflies", "independence", "metrics"},
     {"correct", "candidates", "history"},
     {"files", "facts"},
     {"shot", "tradeoff", "report"},
