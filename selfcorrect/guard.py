@@ -69,9 +69,9 @@ class Estimate:
         The guard hardly counts them: their own radiance, by which it weighs, hides them.
         """
         denoised = self.denoised + fireflies
-        if denoised == 0:
+        left = self.corrected / denoised if denoised > 0 else 1.0
+        if left >= 1:  # lost in the rounding of a far larger error
             return self
-        left = self.corrected / denoised
         return replace(
             self,
             denoised=denoised,

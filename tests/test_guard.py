@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from selfcorrect.guard import Evidence, Guarded, Pair, keep_light_
+from selfcorrect.guard import Estimate, Evidence, Guarded, Pair, keep_light_
 from selfcorrect.guard import guard as guard_by_evidence
 from selfcorrect.image import bands
 from selfcorrect.stages.core.transfer import gained_by_both
@@ -176,3 +176,12 @@ def test_bands_of_rows_give_what_the_whole_image_gives(improves: bool, monkeypat
     torch.testing.assert_close(lit, lit_whole, rtol=2e-7, atol=1e-9)
     for name, value in vars(whole.estimate).items():
         assert getattr(banded.estimate, name) == pytest.approx(value, rel=1e-9), name
+
+
+def test_fireflies_that_are_gone_were_an_error_of_the_denoised_image() -> None:
+    estimate = Estimate(0.5, 0.02, 0.02, 0.0, 0.0, improved=False).without(0.06, 0.04)
+    assert (estimate.denoised, estimate.corrected, estimate.improved) == (0.08, 0.02, True)
+    assert estimate.change == pytest.approx(-0.75)
+    assert estimate.standard_error == pytest.approx(0.25 * 0.04 / 0.08), "of one minus 0.02 over the error before"
+    huge = Estimate(0.5, 1e36, 1e36, 0.0, 0.0, improved=False)
+    assert huge.without(1e3, 1e3) is huge, "no gain is claimed that rounding hides"
