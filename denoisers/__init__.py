@@ -16,7 +16,18 @@ from types import ModuleType
 from denoisers.host import Denoise, DualPlugin, Plugin
 from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
-__all__ = ["PACKAGED", "Denoise", "DualPlugin", "Plugin", "check_threads", "create", "default", "names", "variants"]
+__all__ = [
+    "PACKAGED",
+    "Denoise",
+    "DualPlugin",
+    "Plugin",
+    "check_threads",
+    "create",
+    "default",
+    "fallback",
+    "names",
+    "variants",
+]
 
 PACKAGED = Path(__file__).resolve().parent / "weights" / "denoiser.onnx"
 """The project's own model: ``onnx`` without a path."""
@@ -47,6 +58,18 @@ def default() -> str:
         if importlib.util.find_spec(package) is not None:
             return name
     return "joint-bilateral"
+
+
+def fallback() -> str:
+    """Return one line on what :func:`default` does without and how to get it; empty where it is ``oidn``.
+
+    The errors are those of `scripts/train/evaluate.py`, over OIDN's on 15 frames; RESULTS.md has the table.
+    """
+    error = {"oidn": "", "onnx": "1.9", "joint-bilateral": "4.7"}[default()]
+    return error and (
+        f"oidn is not installed: {default()} denoises instead, with {error} times its error on average; "
+        "run: pip install 'selfcorrect[oidn]'"
+    )
 
 
 def variants(spec: str) -> tuple[str, ...]:

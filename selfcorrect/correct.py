@@ -11,6 +11,7 @@ from torch import Tensor
 
 from selfcorrect import stages
 from selfcorrect.errors import DeviceError, FrameError
+from selfcorrect.fireflies import Removed, remove_fireflies_
 from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
@@ -43,6 +44,7 @@ class Result:
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
+        removed: fireflies that were taken out of the corrected colour; None where the settings keep them.
         input_scale: what radiance was multiplied by.
         start: whether training went on from ``warm_start``, and why.
     """
@@ -52,6 +54,7 @@ class Result:
     losses: list[float]
     seconds: dict[str, float]
     estimate: Estimate | None
+    removed: Removed | None
     input_scale: float
     start: Start
 
@@ -152,13 +155,22 @@ def correct(
         begun = time.perf_counter()
         image, guarded = judge.blend(state, image)
         seconds["guard"] = time.perf_counter() - begun
+    estimate = guarded.estimate if guarded else None
+    removed = None
+    if settings.fireflies == "remove":
+        begun = time.perf_counter()
+        removed = remove_fireflies_(image, frame.color, given.halves, first.full, scale=first.scale)
+        if estimate is not None and removed.pixels:
+            estimate = estimate.without(removed.error, removed.standard_error)
+        seconds["fireflies"] = time.perf_counter() - begun
     maps = dict(zip(_MAPS, guarded.maps(), strict=True)) if guarded else {}
     return Result(
         outputs={COLOR_OUTPUT: frame.like_input(image), **maps},
         network=learned.network if learned else None,
         losses=learned.losses if learned else [],
         seconds=seconds,
-        estimate=guarded.estimate if guarded else None,
+        estimate=estimate,
+        removed=removed,
         input_scale=first.scale,
         start=learned.start if learned else Start(warm=False),
     )
@@ -173,6 +185,7 @@ def _kept(frame: Frame, first: StageImages) -> Result:
         losses=[],
         seconds={},
         estimate=Estimate(0.0, 0.0, 0.0, 0.0, 0.0, improved=False, independent=False),
+        removed=None,
         input_scale=first.scale,
         start=Start(warm=False),
     )

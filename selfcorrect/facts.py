@@ -11,6 +11,7 @@ import torch
 from selfcorrect import words
 from selfcorrect.correct import Result
 from selfcorrect.exr.passes import Others
+from selfcorrect.fireflies import Removed
 from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
 from selfcorrect.history import History
@@ -111,6 +112,7 @@ class Corrected:
         preset: the name that the settings came from.
         settings: of the correction, as they were asked for.
         estimate: what the guard says was gained; None where it is off.
+        removed: fireflies that were taken out; None where they are kept.
         start: what training began from.
         seconds: of each stage.
         input_scale: what radiance was multiplied by.
@@ -126,6 +128,7 @@ class Corrected:
     preset: str
     settings: Settings
     estimate: Estimate | None
+    removed: Removed | None
     start: Start
     seconds: Mapping[str, float]
     input_scale: float
@@ -146,6 +149,7 @@ class Corrected:
             preset=preset,
             settings=settings,
             estimate=result.estimate,
+            removed=result.removed,
             start=result.start,
             seconds=dict(result.seconds),
             input_scale=result.input_scale,
@@ -178,6 +182,7 @@ class Corrected:
             "denoiser": self.before.denoiser,
             "version": self.version,
             "estimate": None if self.estimate is None else asdict(self.estimate),
+            "fireflies": None if self.removed is None else self.removed._asdict(),
             "start": self.start._asdict(),
             **self.more,
         }
@@ -229,8 +234,10 @@ class Written:
 
     def lines(self) -> list[str]:
         """For the log: what was clipped, how long it took, and last what was gained, in words before numbers."""
-        estimate = self.corrected.estimate
+        estimate, removed = self.corrected.estimate, self.corrected.removed
         lines = []
+        if removed is not None and removed.pixels:
+            lines.append(str(removed))
         if self.clipped:
             lines.append(f"{self.output}: {self.clipped} values beyond the range of half floats were clipped")
         spent = ", ".join(f"{name} {value:.1f} s" for name, value in self.corrected.seconds.items())

@@ -5,11 +5,8 @@ been. For the blend z + α (g − z) the error is a parabola in α whose two coe
 
     n = w (y^b − z^a)·(g^a − z^a),   d = w ‖g^a − z^a‖²,   w = 1 / (mean_rgb(z)² + 0.01)
 
-averaged over pixels and summed over both directions; its minimum is α = n / d. With several candidates g_k there is an
-n_k of each and a d_km of each two, and the weights α_k ≥ 0 are those of a small least-squares problem. Locally n is
-mostly noise, and a single firefly in the witness can turn its sign. So the evidence is pooled from coarse to fine: the
-whole frame first, then tiles of 128, 64, 32 and 16 pixels. Each level starts from what the level above found, moves as
-far as its own evidence is certain, and then takes off one standard error.
+averaged over pixels and summed over both directions; its minimum is α = n / d. How α is found for several candidates
+and ever smaller tiles is in :mod:`selfcorrect.pooling`.
 
 The image is gone through in bands of rows (:mod:`selfcorrect.image.bands`): only n and d are kept for every pixel,
 the rest as means over tiles of 16 pixels. Standard errors are taken over these tiles: evidence inside one may be
@@ -19,30 +16,24 @@ Measured with `scripts/bench/quality.py`; README has the numbers.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, shares, tile_means, widened
+from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
 from selfcorrect.image.exposure import Radiance
+from selfcorrect.pooling import pairs, pooled, taken_off
 
 __all__ = ["Estimate", "Evidence", "Guarded", "guard", "keep_light_"]
 
-_LEVELS = (128, 64, 32, 16)  # sides of the tiles
-_LARGEST_SPREAD = 0.25  # of a tile's α about that of the tile around it, squared
-_LEAST_SPREAD = 0.01
-_ROUNDS = 8  # of the frame's robust fit
-_OUTLYING = 3.0  # usual rests
-_MEDIAN_OF_NORMAL = 0.6745  # of the size of a normal variable, in standard deviations
 _OUTERMOST = 0.005  # share of the tiles at either end that the verdict pulls in
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
-_SWEEPS = 16  # over several candidates
-_FLOOR = torch.finfo(torch.float64).tiny
 _LARGEST_SCALE = 1.02  # of the whole image, to keep its light
 _BIAS_SHRINKS = 0.45  # how much of the denoiser's change with the noise is taken for a change of its bias
 
@@ -71,6 +62,23 @@ class Estimate:
     standard_error: float
     improved: bool
     independent: bool = True
+
+    def without(self, fireflies: float, uncertain: float) -> Self:
+        """The estimate of an output without fireflies, whose relMSE in the denoised image was this, and how uncertain.
+
+        The guard hardly counts them: their own radiance, by which it weighs, hides them.
+        """
+        denoised = self.denoised + fireflies
+        left = self.corrected / denoised if denoised > 0 else 1.0
+        if left >= 1:  # lost in the rounding of a far larger error
+            return self
+        return replace(
+            self,
+            denoised=denoised,
+            change=left - 1,
+            standard_error=math.hypot(self.standard_error * self.denoised, left * uncertain) / denoised,
+            improved=True,
+        )
 
     def __str__(self) -> str:
         if not self.independent:
@@ -141,7 +149,7 @@ class Evidence:
                 changes = [pair[i][part].double() - z[i] for pair in halves]
                 weight, residual = self.weight(i, band), y[1 - i] - z[i]
                 products = [residual * change for change in changes]
-                products += [changes[k] * changes[m] for k, m in _pairs(self.candidates)]
+                products += [changes[k] * changes[m] for k, m in pairs(self.candidates)]
                 for plane, product in enumerate(products):
                     self._nd[i, plane, band] = weight * product.mean(-1)
 
@@ -176,20 +184,6 @@ def _log_level(radiance: Radiance, rows: slice) -> Tensor:
     return radiance[rows].double().mean(-1).clamp(min=_DARKEST).log()[None]
 
 
-def _pairs(candidates: int) -> list[tuple[int, int]]:
-    """The order in which d of each two candidates is kept.
-
-    >>> _pairs(2)
-    [(0, 0), (0, 1), (1, 1)]
-    """
-    return [(k, m) for k in range(candidates) for m in range(k, candidates)]
-
-
-def _place(k: int, m: int, candidates: int) -> int:
-    """Where d of two candidates is among those of :func:`_pairs`."""
-    return _pairs(candidates).index((min(k, m), max(k, m)))
-
-
 def guard(
     evidence: Evidence, denoised_full: Radiance, images: Sequence[Radiance], *, scale: float = 1.0, out: Tensor
 ) -> Guarded:
@@ -203,14 +197,14 @@ def guard(
         out: (H, W, 3), what the blend is written to; it may be the last of ``images``.
     """
     size, count = evidence.size, evidence.candidates
-    chosen = [_pooled(size, partial(evidence.nd, i), count) for i in (0, 1)]
+    chosen = [pooled(size, partial(evidence.nd, i), count) for i in (0, 1)]
 
     def judged(rows: slice) -> tuple[Tensor, Tensor]:
         """What one direction alone would choose is judged by the witness of the other: the gain, with and without w."""
         gain, unweighted = [], []
         for i in (0, 1):
             alpha, nd = enlarged_rows(chosen[i], size, rows), evidence.nd(1 - i, rows)
-            gain.append(_gain(alpha, nd))
+            gain.append(taken_off(alpha, nd))
             unweighted.append(gain[i] / evidence.weight(1 - i, rows))
         return gain[0] + gain[1], unweighted[0] + unweighted[1]
 
@@ -223,7 +217,7 @@ def guard(
     means = average(gain, size)
     improved = all(mean > 0 and _more_than_chance(tiles) for mean, tiles in zip(means, gain, strict=True))
 
-    alpha = _pooled(size, evidence.both, count) if improved else gain.new_zeros(count, 1, 1)
+    alpha = pooled(size, evidence.both, count) if improved else gain.new_zeros(count, 1, 1)
     for rows in bands(size[0]):
         full, weights = denoised_full[rows].double(), enlarged_rows(alpha, size, rows)
         blend = full
@@ -245,17 +239,6 @@ def guard(
 
     estimate, errors = _estimate(tile_means(size[0], squares), size, improved)
     return Guarded(out, estimate, alpha.expand(count, *errors.shape[1:]), errors)
-
-
-def _gain(alpha: Tensor, nd: Tensor) -> Tensor:
-    """What weights α take off half the squared error: Σ_k α_k n_k − Σ_kl α_k α_l d_kl / 2."""
-    count = len(alpha)
-    gain = alpha[0] * nd[0]
-    for k in range(1, count):
-        gain = gain + alpha[k] * nd[k]
-    for (k, m), d in zip(_pairs(count), nd[count:], strict=True):
-        gain = gain - alpha[k] * alpha[m] * d / (2 if k == m else 1)
-    return gain
 
 
 def _metric_weight(radiance: Tensor, scale: float) -> Tensor:
@@ -299,93 +282,6 @@ def _estimate(squares: Tensor, size: tuple[int, int], improved: bool) -> tuple[E
     before = left * (squares[1] - squares[0] / 2 - squares[2] / 2) + squares[2] / 4
     after = before - squares[4] * (denoised / half if half > 0 else 0.0)
     return estimate, torch.stack([before, after])
-
-
-def _pooled(size: tuple[int, int], nd: Callable[[slice], Tensor], count: int) -> Tensor:
-    """α over the smallest tiles, (K, h, w), from evidence pooled over the frame, then over ever smaller tiles."""
-    alpha = _of_frame(tile_means(size[0], nd), size, count)
-    for side in _LEVELS:
-        if side > max(size):
-            continue
-        moments = tile_means(size[0], partial(_moments, size, nd, alpha), side)
-        n, d, around, scatter = moments.split([count, count * (count + 1) // 2, count, count])
-        variance = scatter / side**2
-        curvature = torch.stack([d[_place(k, k, count)] for k in range(count)])
-        spread = _spread(_left(n, d, around), curvature, variance)
-        ridge = (variance / (spread * curvature).clamp(min=_FLOOR)).clamp(max=1 / _FLOOR)
-        alpha = _solved(n, d, around, ridge, variance.sqrt())
-    return alpha
-
-
-def _of_frame(tiles: Tensor, size: tuple[int, int], count: int) -> Tensor:
-    """One α of each candidate for the whole frame, (K, 1, 1), by a least-squares fit that outlying tiles cannot lead.
-
-    A firefly in the witness makes n of its tile larger than that of all others together. So tiles are weighed down by
-    what the fit leaves of their n, 1 / (1 + (rest / 3s)²) with s the usual rest (Cauchy weights, fitted in rounds).
-    """
-    n, d = tiles[:count].flatten(1), tiles[count:].flatten(1)
-    weight = shares(tiles, size).flatten()
-    trust = torch.ones_like(weight)
-    nothing = tiles.new_zeros(count, 1, 1)
-    alpha = nothing
-    for _ in range(_ROUNDS):
-        share = weight * trust / (weight * trust).sum()
-        means = [(planes * share).sum(1).reshape(-1, 1, 1) for planes in (n, d)]
-        variance = ((n - means[0].flatten(1)) ** 2 * share).sum(1) * (share**2).sum()
-        chance = variance.sqrt() if n.shape[1] > 1 else n[:, 0].abs()
-        alpha = _solved(means[0], means[1], nothing, nothing, chance.reshape(-1, 1, 1))
-        rest = _left(n, d, alpha.flatten(1))
-        usual = rest.abs().median(1, keepdim=True).values.clamp(min=_FLOOR) / _MEDIAN_OF_NORMAL
-        trust = 1 / (1 + ((rest / (_OUTLYING * usual)) ** 2).amax(0))
-    return alpha
-
-
-def _spread(left: Tensor, curvature: Tensor, variance: Tensor) -> Tensor:
-    """How far α of a tile lies from that of the tile around it, squared, as a mean over all tiles, (K, 1, 1).
-
-    What the tiles' own estimates differ by, less what chance explains; tiles count by how certain they are. Where it is
-    small, as with an image that is as good everywhere, tiles keep to what the frame says.
-    """
-    certain = (variance + _LARGEST_SPREAD * curvature**2).clamp(min=_FLOOR)
-    found = ((left**2 - variance) / certain).clamp(max=1 / _LARGEST_SPREAD).sum((1, 2), keepdim=True)
-    weights = (curvature**2 / certain).sum((1, 2), keepdim=True).clamp(min=_FLOOR)
-    return (found / weights).clamp(_LEAST_SPREAD, _LARGEST_SPREAD)
-
-
-def _left(n: Tensor, d: Tensor, alpha: Tensor) -> Tensor:
-    """n_k − Σ_m α_m d_km: what the weights α leave of n, in the shape of n."""
-    count = len(n)
-    rest = list(n)
-    for k in range(count):
-        for m in range(count):
-            rest[k] = rest[k] - alpha[m] * d[_place(k, m, count)]
-    return torch.stack(rest)
-
-
-def _solved(n: Tensor, d: Tensor, around: Tensor, ridge: Tensor, chance: Tensor) -> Tensor:
-    """The α ≥ 0 of sum ≤ 1 at which Σ α_k n_k − Σ α_k α_m d_km / 2 − Σ ridge_k (α_k − around_k)² / 2 is largest.
-
-    One after the other, each is moved to where the others leave it; less its chance, one standard error of n.
-    """
-    count = len(n)
-    alpha = list(around)
-    for k in list(range(count)) * (1 if count == 1 else _SWEEPS):
-        left, share = n[k], torch.ones_like(n[k])
-        for m in range(count):
-            if m != k:
-                left = left - alpha[m] * d[_place(k, m, count)]
-                share = share - alpha[m]
-        curvature = (d[_place(k, k, count)] + ridge[k]).clamp(min=_FLOOR)
-        moved = (left + ridge[k] * around[k] - chance[k]) / curvature
-        alpha[k] = torch.minimum(moved.clamp(min=0), share.clamp(min=0))
-    return torch.stack(alpha)
-
-
-def _moments(size: tuple[int, int], nd: Callable[[slice], Tensor], alpha: Tensor, rows: slice) -> Tensor:
-    """What a level needs the means of: n, d, the α of the level above, and the squared rest that this α leaves."""
-    evidence, around = nd(rows), enlarged_rows(alpha, size, rows)
-    count = len(alpha)
-    return torch.cat([evidence, around, _left(evidence[:count], evidence[count:], around) ** 2])
 
 
 def _more_than_chance(tiles: Tensor) -> bool:

@@ -151,11 +151,17 @@ class Settings:
     )
     inference: str = _setting(
         "halves",
-        "denoised image that the result is inferred with: the halves', or the full buffer's where they agree",
+        "the result is the mean of the corrected halves, or full: that and what the denoiser gains from both together",
         f"{_PAPER}, Sec. 4",
         choices=("halves", "full"),
     )
     guard: bool = _setting(False, "blend with the denoised image as far as the halves confirm it", _OURS)
+    fireflies: str = _setting(
+        "keep",
+        "that the denoiser has left in one half only: remove, within a hundredth of the light, or keep",
+        "not in the paper; scripts/bench/fireflies.py measures it",
+        choices=("remove", "keep"),
+    )
     crossed_weights: bool = _setting(
         False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
@@ -250,6 +256,7 @@ class Settings:
             initialisation="residual",
             inference="full",
             guard=True,
+            fireflies="remove",
             crossed_weights=True,
             precision="bf16",
             candidates="auto",

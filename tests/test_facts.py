@@ -6,6 +6,7 @@ from importlib.metadata import version
 
 from selfcorrect import Settings, facts
 from selfcorrect.exr.passes import Others
+from selfcorrect.fireflies import Removed
 from selfcorrect.guard import Estimate
 from selfcorrect.image.repair import Repairs
 from selfcorrect.stages.stage import Start
@@ -21,11 +22,13 @@ DENOISED = facts.Denoised(
     promises={"oidn:none": 0.25, "oidn:fast": 0.0},
     candidates=("oidn:none",),
 )
+REMOVED = Removed(pixels=0.002, light=0.0015, error=0.25, standard_error=0.125)
 CORRECTED = facts.Corrected(
     before=DENOISED,
     preset="fast",
     settings=Settings(seed=7),
     estimate=ESTIMATE,
+    removed=REMOVED,
     start=Start(warm=True, cold_loss=0.5, warm_loss=0.25),
     seconds={"train": 1.0, "infer": 0.25},
     input_scale=2.0,
@@ -41,6 +44,7 @@ RUN = {
     "denoiser": "box",
     "version": version("selfcorrect"),
     "estimate": asdict(ESTIMATE),
+    "fireflies": {"pixels": 0.002, "light": 0.0015, "error": 0.25, "standard_error": 0.125},
     "start": {"warm": True, "cold_loss": 0.5, "warm_loss": 0.25},
     "frame": 3,
 }
@@ -83,13 +87,15 @@ def test_log() -> None:
         "candidate oidn:fast: left out, a few crops promise 0 % less error",
     ]
     assert WRITTEN.lines() == [
+        "fireflies of one half were removed from 0.20% of the pixels, with 0.15% of the light; --fireflies keep leaves "
+        "them",
         "out.exr: 4 values beyond the range of half floats were clipped",
         "other channels: 3 the mean of both halves, 2 as in half a",
         "out.exr: written after 2.0 s (train 1.0 s, infer 0.2 s)",
         "out.exr: error about 25 % lower, mostly in the highlights (relMSE ≈ 0.02 → 0.015, -25 ± 3 %)",
     ]
-    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None))
-    assert unguarded.lines() == WRITTEN.lines()[1:2]
+    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None, removed=None))
+    assert unguarded.lines() == WRITTEN.lines()[2:4]
     assert unguarded.to_dict()["estimate"] is None
 
 

@@ -5,10 +5,10 @@ import torch
 from helpers.tolerances import EXACT, LIGHT, near
 from torch import Tensor
 
-from selfcorrect.guard import Evidence, Guarded, Pair, keep_light_
+from selfcorrect.guard import Estimate, Evidence, Guarded, Pair, keep_light_
 from selfcorrect.guard import guard as guard_by_evidence
 from selfcorrect.image import bands
-from selfcorrect.stages.core.trust import trust_in_full
+from selfcorrect.stages.core.transfer import gained_by_both
 
 SIZE = (160, 192)
 
@@ -165,16 +165,24 @@ def test_bands_of_rows_give_what_the_whole_image_gives(improves: bool, monkeypat
 
     def run() -> tuple[Guarded, Tensor, Tensor]:
         guarded = guard(color, denoised, corrected, full, image, scale=0.7)
-        trusted = torch.cat([trust_in_full(denoised, full, rows) for rows in bands.bands(size[0])])
-        return guarded, trusted, keep_light_(0.9 * guarded.image, full, color)
+        return guarded, gained_by_both(denoised, full + 0.01), keep_light_(0.9 * guarded.image, full, color)
 
-    (banded, trusted, lit), _ = run(), monkeypatch.setattr(bands, "_BAND", 1024)
-    whole, trusted_whole, lit_whole = run()
+    (banded, gained, lit), _ = run(), monkeypatch.setattr(bands, "_BAND", 1024)
+    whole, gained_whole, lit_whole = run()
     assert whole.estimate.improved == improves
-    assert trusted_whole.min() < 0.1
-    assert torch.equal(trusted, trusted_whole)
+    assert 0 < gained_whole.min() < gained_whole.max()
+    torch.testing.assert_close(gained, gained_whole, rtol=1e-9, atol=0)
     torch.testing.assert_close(banded.image, whole.image, rtol=2e-7, atol=1e-9)
     torch.testing.assert_close(torch.stack(banded.maps()), torch.stack(whole.maps()), **near("guard in bands"))
     torch.testing.assert_close(lit, lit_whole, rtol=2e-7, atol=1e-9)
     for name, value in vars(whole.estimate).items():
         assert getattr(banded.estimate, name) == pytest.approx(value, rel=EXACT, abs=0), name
+
+
+def test_fireflies_that_are_gone_were_an_error_of_the_denoised_image() -> None:
+    estimate = Estimate(0.5, 0.02, 0.02, 0.0, 0.0, improved=False).without(0.06, 0.04)
+    assert (estimate.denoised, estimate.corrected, estimate.improved) == (0.08, 0.02, True)
+    assert estimate.change == pytest.approx(-0.75)
+    assert estimate.standard_error == pytest.approx(0.25 * 0.04 / 0.08), "of one minus 0.02 over the error before"
+    huge = Estimate(0.5, 1e36, 1e36, 0.0, 0.0, improved=False)
+    assert huge.without(1e3, 1e3) is huge, "no gain is claimed that rounding hides"

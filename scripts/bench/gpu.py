@@ -174,7 +174,7 @@ def predicted(card: Card, preset: str, size: tuple[int, int], table: list[Varian
     steps = steps_count(size, settings)
     a_kernel, a_network, host = 2 * kernel(pixels, loss), convolutions(2 * pixels, 3), launches * LAUNCH
     step = max(a_kernel + a_network, host)
-    whole = size[0] * size[1] * (4 if settings.inference == "full" else 2)
+    whole = 2 * size[0] * size[1]
     inference = kernel(whole, forward) + convolutions(whole, 1)
     rest = REST * size[0] * size[1] / 2**20
     total = steps * step + inference + rest

@@ -100,6 +100,8 @@ class Runner:
         self._denoise = None
         if options.denoiser is not None or not given:
             self._denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
+            if options.denoiser is None and denoisers.fallback():
+                log(denoisers.fallback())
         self._further = {}
         if self._denoise is not None and self.settings.guard and self.settings.candidates != "none":
             self._further = {

@@ -59,6 +59,20 @@ def test_frame_writes_a_corrected_image_and_passes_the_rest_through(halves: tupl
     assert [p.name for p in tmp_path.iterdir() if "tmp" in p.name] == []
 
 
+@pytest.mark.parametrize("named", [True, False])
+def test_a_default_without_oidn_is_told_of(
+    named: bool, halves: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("mitsuba_oidn", "onnxruntime"):
+        monkeypatch.setitem(sys.modules, package, None)
+    flags = [*FAST[: -len(BOX)], *(["--denoiser", "joint-bilateral"] if named else [])]
+    result = call("frame", *halves, "-o", tmp_path / "out.exr", *flags)
+    assert result.returncode == 0, result.stderr
+    told = [line for line in result.stderr.splitlines() if "oidn is not installed" in line]
+    assert len(told) == (0 if named else 1)
+    assert named or told[0].endswith("run: pip install 'selfcorrect[oidn]'")
+
+
 def test_same_seed_writes_the_same_pixels(halves: tuple[Path, Path], tmp_path: Path) -> None:
     for name in ("one", "two"):
         assert call("frame", *halves, "-o", tmp_path / f"{name}.exr", *FAST).returncode == 0

@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor
 
-from selfcorrect.buffers import DENOISED
 from selfcorrect.frame import Half
 from selfcorrect.image.tiles import Region, tiles
 from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral
@@ -22,7 +21,6 @@ def infer(
     settings: Settings,
     *,
     scale: float = 1.0,
-    denoised: Tensor | None = None,
     side: int = SIDE,
     rows: slice | None = None,
 ) -> Tensor:
@@ -33,7 +31,6 @@ def infer(
         half: its buffers, radiance not scaled.
         settings: of the network.
         scale: what radiance is multiplied by.
-        denoised: another denoised image than the half's own.
         side: of the tiles, pixels.
         rows: those wanted, by default all.
     """
@@ -41,7 +38,7 @@ def infer(
     image = half.color.new_empty(beyond - first, half.color.shape[1], 3)
     for top, left, bottom, right in tiles((image.shape[0], image.shape[1]), side):
         region = (first + top, left, first + bottom, right)
-        image[top:bottom, left:right] = infer_tile(network, half, settings, region, scale=scale, denoised=denoised)
+        image[top:bottom, left:right] = infer_tile(network, half, settings, region, scale=scale)
     return image
 
 
@@ -53,19 +50,15 @@ def infer_tile(
     region: Region,
     *,
     scale: float = 1.0,
-    denoised: Tensor | None = None,
 ) -> Tensor:
     """One region (top, left, bottom, right) of what :func:`infer` gives."""
-    buffers: dict[str, Tensor | None] = half._asdict()
-    if denoised is not None:
-        buffers[DENOISED.name] = denoised
     height, width, _ = half.color.shape
     top, left, bottom, right = region
     reach = settings.layers  # zeros are padded at the image's border alone
     above, before = min(reach, top), min(reach, left)
     below, after = min(reach, height - bottom), min(reach, width - right)
     window = Window.of(settings).whole
-    guides = Guides.of_half(buffers, margin=max(window.radius, reach), scale=scale, region=region)
+    guides = Guides.of_half(half._asdict(), margin=max(window.radius, reach), scale=scale, region=region)
     origin = torch.zeros(1, 2, dtype=torch.int64)
     around = (above + guides.height + below, before + guides.width + after)
     raw = network(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from selfcorrect.buffers import DENOISED
 from selfcorrect.frame import Half, mean
-from selfcorrect.image.bands import bands
+from selfcorrect.image.bands import bands, enlarged_rows
 from selfcorrect.image.exposure import Scaled, scale_
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.settings import Settings
@@ -20,7 +20,7 @@ from selfcorrect.stages.core.infer import SIDE, infer, infer_tile
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.patches import crops, overhang
 from selfcorrect.stages.core.train import Limits, Progress, starting_losses, train
-from selfcorrect.stages.core.trust import trust_in_full
+from selfcorrect.stages.core.transfer import gained_by_both
 from selfcorrect.stages.images import StageImages
 from selfcorrect.stages.stage import Keep, Learned, Outcome, Stage, Start, Work
 
@@ -58,26 +58,23 @@ def trained(
 
 
 def inferred(state: StageImages, network: Network, settings: Settings, keep: Keep) -> Tensor:
-    """The corrected image, of each half with its own denoised image, and of both with the full one where that helps.
+    """The corrected image: the mean of both corrected halves, with what the denoiser gains from both where asked for.
 
-    ``keep`` is called with rows and what the network makes there of each half with its own image, of radiance times
-    the state's scale: whole corrected halves are not held here.
+    ``keep`` is called with rows and what the network makes there of each half, of radiance times the state's scale:
+    whole corrected halves are not held here.
     """
     images = Scaled(state.images[0], state.scale), Scaled(state.images[1], state.scale)
     full = Scaled(state.full, state.scale)
     image = torch.empty_like(state.full)
-
-    def corrected(rows: slice, shown: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        a, b = (infer(network, half, settings, scale=state.scale, denoised=shown, rows=rows) for half in state.halves)
-        return a, b
-
-    for rows in bands(image.shape[0], SIDE):
-        halves = corrected(rows)
-        image[rows] = mean(halves)
-        if settings.inference == "full":
-            trust = trust_in_full(images, full, rows).to(image.dtype)
-            image[rows] += trust * (mean(corrected(rows, state.full)) - image[rows])
-        keep(rows, halves)
+    size = (image.shape[0], image.shape[1])
+    gained = gained_by_both(images, full) if settings.inference == "full" else None
+    for rows in bands(size[0], SIDE):
+        a, b = (infer(network, half, settings, scale=state.scale, rows=rows) for half in state.halves)
+        image[rows] = mean((a, b))
+        if gained is not None:
+            share = enlarged_rows(gained, size, rows)[0, :, :, None]
+            image[rows] += share.to(image.dtype) * (full[rows] - mean((images[0][rows], images[1][rows])))
+        keep(rows, (a, b))
     return scale_(image.clamp_(min=0), 1 / state.scale)
 
 
@@ -106,8 +103,7 @@ def _seconds_after_training(network: Network, state: StageImages, settings: Sett
     start = time.perf_counter()
     tile()
     inference = (time.perf_counter() - start) / (region[2] * region[3])
-    passes = 4 if settings.inference == "full" else 2
-    return height * width * (inference * passes + (_GUARD_SECONDS if settings.guard else 0.0))
+    return height * width * (2 * inference + (_GUARD_SECONDS if settings.guard else 0.0))
 
 
 def _warm(settings: Settings) -> Settings:

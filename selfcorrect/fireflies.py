@@ -1,0 +1,222 @@
+"""Fireflies that the denoiser has left: two independent halves show them, where no single image can.
+
+A path of great energy that one half has met and the other has not stays in that half's denoised image as a bright spot,
+and in that of both. Where one denoised half is far brighter than the other, the darker one is taken, if four things say
+that chance has met a firefly and not the other half missed a light. With m the mean of a half's channels, of a frame
+whose mean is near 1, and ε = 0.1:
+
+1. The halves differ: δ = | ln( (m^a + ε) / (m^b + ε) ) | > max(ln 3, 4 s). s is the spread of the halves around: the
+   third quartile of δ in tiles of 16 pixels, of it the median over 5×5 tiles. A frame of few samples, or a caustic,
+   whose halves disagree everywhere, explains its own disagreement.
+2. The other half's *noisy* pixels, which no denoiser has touched, contradict: over 5×5 pixels the brighter half's mean
+   lies two standard errors of theirs above their mean. Where they have met the light as well, and be it in one
+   pixel, that error is large, and it stays.
+3. Somewhere within four pixels the spot outshines what both halves agree on nearly everywhere: the 0.99 quantile of
+   min(m^a, m^b). What is as bright as the frame's lights and their reflections may be one.
+4. The darker half is itself no brighter than that: a lamp or a star that both have met stays, however different.
+
+What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
+given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
+witness; `scripts/bench/fireflies.py` measures the rule against references, one scene left out at a time.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from selfcorrect.image.bands import TILE, bands, enlarged_rows, shares, tile_means, widened
+from selfcorrect.image.exposure import Radiance
+
+__all__ = ["Removed", "Rule", "remove_fireflies_"]
+
+_AROUND = 2  # tiles on each side, of which the median is taken
+_GROWN = 2  # pixels
+_WITNESS = 5  # side of the window of noisy pixels
+_SPOT = 4  # pixels from a spot's brightest part
+_REACH = 2 * _GROWN + _SPOT + _WITNESS // 2
+_MOST_PIXELS = 2**20  # that tell what is bright, in rows spread evenly over the frame
+_STRICTER = 2.0  # each time too much would go, the threshold is multiplied by this
+_TRIES = 5
+
+Pair = tuple[Radiance, Radiance]
+Rows = Callable[[slice], Tensor]
+
+
+class Rule(NamedTuple):
+    """What is a firefly; `scripts/bench/fireflies.py` cross-validates the constants over scenes.
+
+    Attributes:
+        least: how many times brighter one half must be than the other in any case.
+        spreads: how many spreads around δ must exceed.
+        quantile: of δ in a tile, that is its spread.
+        darkest: ε.
+        doubts: standard errors of the other half's noisy pixels.
+        usual: share of the pixels, 0 … 1, that are darker than what may be a light.
+        most: share of the image's light, 0 … 1, that may go.
+    """
+
+    least: float = 3.0
+    spreads: float = 4.0
+    quantile: float = 0.75
+    darkest: float = 0.1
+    doubts: float = 2.0
+    usual: float = 0.99
+    most: float = 0.01
+
+
+class Removed(NamedTuple):
+    """What was taken away.
+
+    Attributes:
+        pixels: share of the pixels that were changed.
+        light: share of the image's mean radiance.
+        error: the relMSE that these fireflies were in the denoised image, if the darker half is right.
+        standard_error: of ``error``: as few spots as there may be are hardly a sample, and of one it is the whole.
+    """
+
+    pixels: float
+    light: float
+    error: float
+    standard_error: float
+
+    def __str__(self) -> str:
+        return (
+            f"fireflies of one half were removed from {self.pixels:.2%} of the pixels, with {self.light:.2%} of the "
+            "light; --fireflies keep leaves them"
+        )
+
+
+def remove_fireflies_(
+    image: Tensor, color: Pair, denoised: Pair, denoised_full: Radiance, *, scale: float = 1.0, rule: Rule | None = None
+) -> Removed:
+    """Remove fireflies from an image that was made of both halves, in place.
+
+    Args:
+        image: (H, W, 3) linear radiance ≥ 0.
+        color: the noisy halves, like the others of the same shape and units.
+        denoised: the denoised halves, each made of one half alone.
+        denoised_full: denoised mean of the halves, whose error is told.
+        scale: what brings radiance to a mean near 1.
+        rule: by default the one that the module describes.
+    """
+    rule = rule or Rule()
+    found = _Search(color, denoised, scale, rule)
+    before = _mean(image, lambda rows: image[rows].double().mean(-1))
+    for _ in range(_TRIES):
+        taken = _mean(image, lambda rows: found.excess(image, rows).mean(-1))
+        if taken <= rule.most * before:
+            break
+        found.stricter *= _STRICTER
+    else:
+        return Removed(0.0, 0.0, 0.0, 0.0)
+    if taken == 0:
+        return Removed(0.0, 0.0, 0.0, 0.0)
+
+    def errors(rows: slice) -> Tensor:
+        excess = found.excess(denoised_full, rows)
+        left = denoised_full[rows].double() - excess
+        return ((excess**2).mean(-1) / (left.mean(-1) ** 2 + 0.01))[None]
+
+    count = image.shape[0] * image.shape[1]
+    spots = tile_means(image.shape[0], errors)
+    spots = spots[0] * shares(spots, (image.shape[0], image.shape[1])) * (TILE**2 / count)
+    pixels = 0.0
+    for rows in bands(image.shape[0]):
+        excess = found.excess(image, rows)
+        pixels += float((excess > 0).any(-1).sum())
+        image[rows] = image[rows].double() - excess
+    return Removed(pixels / count, taken / before, float(spots.sum()), float(spots.square().sum().sqrt()))
+
+
+class _Search:
+    """Where the halves say that a firefly is.
+
+    Attributes:
+        stricter: what the threshold is multiplied by.
+    """
+
+    def __init__(self, color: Pair, denoised: Pair, scale: float, rule: Rule):
+        self.stricter = 1.0
+        self._color, self._denoised, self._scale, self._rule = color, denoised, scale, rule
+        self._size = (denoised[0].shape[0], denoised[0].shape[1])
+        self._spread = _median_around(_tile_quantiles(self._size, self._disagreement, rule.quantile))[None]
+        self._usual = self._usual_brightness()
+
+    def _means(self, images: Pair, rows: slice) -> tuple[Tensor, Tensor]:
+        """m of both halves, (rows, W) each."""
+        a, b = (half[rows].double().mean(-1) * self._scale for half in images)
+        return a, b
+
+    def _disagreement(self, rows: slice) -> Tensor:
+        """δ, (rows, W)."""
+        a, b = self._means(self._denoised, rows)
+        return ((a + self._rule.darkest) / (b + self._rule.darkest)).log().abs()
+
+    def _usual_brightness(self) -> float:
+        step = max(math.ceil(self._size[0] * self._size[1] / _MOST_PIXELS), 1)
+        seen = [torch.minimum(*self._means(self._denoised, rows))[::step].flatten() for rows in bands(self._size[0])]
+        return float(torch.cat(seen).quantile(self._rule.usual))
+
+    def weight(self, rows: slice) -> Tensor:
+        """How far a pixel is a firefly, 0 … 1, (rows, W)."""
+        wide, inner = widened(rows, _REACH, self._size[0])
+        a, b = self._means(self._denoised, wide)
+        spread = enlarged_rows(self._spread, self._size, wide)[0]
+        threshold = self.stricter * (self._rule.spreads * spread).clamp(min=math.log(self._rule.least))
+        found = (self._disagreement(wide) > threshold) & (torch.minimum(a, b) <= self._usual)
+        found &= self._contradicted(a, b, wide)
+        spot = found & (torch.maximum(a, b) > self._usual)
+        found &= _largest_around(spot, _SPOT) > 0
+        return _mean_around(_largest_around(found, _GROWN), _GROWN)[inner]
+
+    def _contradicted(self, a: Tensor, b: Tensor, rows: slice) -> Tensor:
+        """Whether the noisy pixels of the darker half contradict the brighter one, (rows, W)."""
+        reach, doubts = _WITNESS // 2, []
+        for bright, witness in zip((a, b), reversed(self._means(self._color, rows)), strict=True):
+            mean = _mean_around(witness, reach)
+            variance = (_mean_around(witness**2, reach) - mean**2).clamp(min=0)
+            doubts.append(_mean_around(bright, reach) - mean > self._rule.doubts * variance.sqrt() / _WITNESS)
+        contradicted: Tensor = torch.where(a > b, doubts[0], doubts[1])
+        return contradicted
+
+    def excess(self, image: Radiance, rows: slice) -> Tensor:
+        """What to take off rows of an image, (rows, W, 3) ≥ 0."""
+        a, b = (half[rows].double() for half in self._denoised)
+        darker = torch.where(a.mean(-1, keepdim=True) < b.mean(-1, keepdim=True), a, b)
+        return self.weight(rows)[..., None] * (image[rows].double() - darker).clamp(min=0)
+
+
+def _largest_around(marked: Tensor, reach: int) -> Tensor:
+    return F.max_pool2d(marked.double()[None], 2 * reach + 1, 1, reach)[0]
+
+
+def _mean_around(values: Tensor, reach: int) -> Tensor:
+    return F.avg_pool2d(values[None], 2 * reach + 1, 1, reach, count_include_pad=False)[0]
+
+
+def _mean(image: Tensor, pixels: Rows) -> float:
+    total = sum(float(pixels(rows).sum()) for rows in bands(image.shape[0]))
+    return total / (image.shape[0] * image.shape[1])
+
+
+def _tile_quantiles(size: tuple[int, int], pixels: Rows, share: float) -> Tensor:
+    """Of a map, over tiles of 16 pixels, (h, w); border tiles are filled up with the edge's pixels."""
+    strips = []
+    for rows in bands(size[0]):
+        values = pixels(rows)
+        below, right = -values.shape[0] % TILE, -values.shape[1] % TILE
+        padded = F.pad(values[None], (0, right, 0, below), mode="replicate")[0]
+        tiles = padded.unflatten(0, (-1, TILE)).unflatten(2, (-1, TILE)).transpose(1, 2).flatten(2)
+        strips.append(tiles.quantile(share, dim=-1))
+    return torch.cat(strips)
+
+
+def _median_around(tiles: Tensor) -> Tensor:
+    """The median of each tile and those around it; beyond the border the edge's tile counts again."""
+    side = 2 * _AROUND + 1
+    padded = F.pad(tiles[None], (_AROUND,) * 4, mode="replicate")[0]
+    return padded.unfold(0, side, 1).unfold(1, side, 1).flatten(2).median(-1).values
