@@ -17,7 +17,7 @@ whose mean is near 1, and ε = 0.1:
 
 What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
 given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
-witness; `scripts/bench/fireflies.py` measures the rule against references, one scene left out at a time.
+witness; `scripts/bench/fireflies.py` measures the rule against references.
 """
 
 import math
@@ -47,7 +47,7 @@ Rows = Callable[[slice], Tensor]
 
 
 class Rule(NamedTuple):
-    """What is a firefly; `scripts/bench/fireflies.py` cross-validates the constants over scenes.
+    """What is a firefly; `scripts/bench/fireflies.py` tries other values of the constants.
 
     Attributes:
         least: how many times brighter one half must be than the other in any case.

@@ -2,6 +2,9 @@
 
     .venv/bin/python scripts/bench/shot.py ../shared/shot [--preset balanced] [--variants cold warm warm:steps=50 key]
 
+The folder holds ``NAME_a.####.exr``, ``NAME_b``, ``NAME_ref_a``, ``NAME_ref_b`` and perhaps ``NAME_ref_smooth``, else
+the denoised mean of the references; ``scripts/render/ghosts.py`` makes such a folder.
+
 Variants: ``cold`` (each frame on its own), ``warm`` (each from the last one's network, with the preset's settings for
 that), ``key`` (each from the first frame's network), ``history`` (warm, with the samples of the neighbours that are in
 the folder; ``candidate`` is its image before any guard), and any of them with settings changed:
@@ -31,13 +34,19 @@ def load(folder: Path, number: int, denoiser: str, threads: int) -> tuple[Frame,
     """A denoised frame and its references: two independent ones, and the smooth one."""
 
     def file(kind: str) -> Path:
-        shot = next(folder.glob("*_ref_smooth.*.exr")).name.partition("_ref_smooth")[0]
+        shot = next(folder.glob("*_ref_a.*.exr")).name.partition("_ref_a")[0]
         return folder / f"{shot}_{kind}.{number:04d}.exr"
 
-    a, b = (exr.load_half(file(half)).buffers for half in "ab")
-    references = [exr.load_half(file(f"ref_{r}")).buffers["color"] for r in ("a", "b", "smooth")]
-    frame = Frame(**{role: (a[role], b[role]) for role in ROLES if role in a})
-    return frame.denoise(denoisers.create(denoiser, threads=threads), keep_aids=True), references
+    plugin = denoisers.create(denoiser, threads=threads)
+    a, b, *both = (exr.load_half(file(kind)).buffers for kind in ("a", "b", "ref_a", "ref_b"))
+    frame = Frame(**{role: (a[role], b[role]) for role in ROLES if role in a}).denoise(plugin, keep_aids=True)
+    references = [np.asarray(buffers["color"]) for buffers in both]
+    if file("ref_smooth").exists():
+        references.append(exr.load_half(file("ref_smooth")).buffers["color"])
+    else:
+        reference = Frame(**{role: (both[0][role], both[1][role]) for role in ROLES if role in both[0]})
+        references.append(np.asarray(reference.denoise(plugin).denoised_full))
+    return frame, references
 
 
 def corrected(frames: list[Frame], preset: str, variant: str, denoiser: Any) -> tuple[list[Any], list[float]]:
@@ -71,7 +80,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    numbers = sorted(int(p.name.split(".")[-2]) for p in options.folder.glob("*_ref_smooth.*.exr"))
+    numbers = sorted(int(p.name.split(".")[-2]) for p in options.folder.glob("*_ref_a.*.exr"))
     denoiser = denoisers.create(options.denoiser, threads=options.threads)
     loaded = [load(options.folder, number, options.denoiser, options.threads) for number in numbers]
     frames, references = [frame for frame, _ in loaded], [reference for _, reference in loaded]
