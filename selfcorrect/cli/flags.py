@@ -17,6 +17,7 @@ from selfcorrect.stages.stage import Extra
 __all__ = [
     "add_aovs",
     "add_extra",
+    "add_maxmem",
     "add_preset",
     "add_run_flags",
     "add_settings",
@@ -35,6 +36,16 @@ def add_aovs(parser: argparse.ArgumentParser) -> None:
         metavar="auto|NAME,NAME|none",
         help="correct these AOVs so that they sum to the corrected picture; auto: every set of light passes or light "
         "groups that sums to it in the render; alpha among the names: also that",
+    )
+
+
+def add_maxmem(parser: argparse.ArgumentParser) -> None:
+    """The most memory to take."""
+    parser.add_argument(
+        "--maxmem",
+        metavar="SIZE",
+        help="most memory to take, such as 6G; a frame that does not fit is refused at once. OIDN works in what is "
+        "left, with the same result; other denoisers are not held to it",
     )
 
 

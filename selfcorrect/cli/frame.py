@@ -22,12 +22,7 @@ def add(commands: Any) -> None:
     halves.add(parser)
     flags.add_extra(parser)
     parser.add_argument("-o", "--output", metavar="OUT.exr", help="half a with its colour corrected")
-    parser.add_argument(
-        "--maxmem",
-        metavar="SIZE",
-        help="most memory to take, such as 6G; a frame that does not fit is refused at once. OIDN works in what is "
-        "left, with the same result; other denoisers are not held to it",
-    )
+    flags.add_maxmem(parser)
     pages.add_flag(parser)
     flags.add_aovs(parser)
     flags.add_run_flags(parser)
@@ -48,6 +43,23 @@ def _frame(options: argparse.Namespace) -> None:
         answer(written.to_dict())
 
 
+def fitted(
+    options: argparse.Namespace, maxmem: str, sources: files.Sources, *, extra: int = 0, shot: bool = False
+) -> int:
+    """Change the settings in ``options`` to what there is room for, and tell of it.
+
+    Returns:
+        Bytes that are left for OIDN.
+    """
+    limit = memory.parse_size(maxmem)
+    changes, lines = memory.reduced(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
+    for name, value in changes.items():
+        setattr(options, name, value)
+    for line in lines:
+        log(line)
+    return memory.scratch_within(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
+
+
 def correct_files(
     options: argparse.Namespace,
     sources: files.Sources,
@@ -63,13 +75,9 @@ def correct_files(
     start = time.perf_counter()
     scratch = None
     if maxmem is not None:
-        size, settings = memory.parse_size(maxmem), flags.settings_of(options)
+        settings = flags.settings_of(options)
         extra = sum(len(paths) for paths in flags.extra_files(options, settings).values())
-        if settings.candidates != "none" and not memory.fits(size, sources, settings, extra=extra):
-            options.candidates = "none"
-            settings = flags.settings_of(options)
-            log(f"no further candidates: --maxmem {maxmem} has no room for them")
-        scratch = memory.scratch_within(size, sources, settings, extra=extra)
+        scratch = fitted(options, maxmem, sources, extra=extra)
     runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
     remove_abandoned(exr.check_target(output).parent)
     with EndOnInterrupt() as stop:

@@ -6,7 +6,8 @@ command.
 
 import math
 import re
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 
@@ -21,7 +22,7 @@ from selfcorrect.files import Sources
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.patches import crops
 
-__all__ = ["Needs", "check_held", "fits", "needs", "parse_size", "scratch_within"]
+__all__ = ["Needs", "check_held", "fits", "needs", "parse_size", "reduced", "scratch_within"]
 
 GIB = 2**30
 _BASE = 0.35 * GIB  # the interpreter, torch, the OpenEXR library and OIDN's weights
@@ -31,6 +32,7 @@ _LEAST_SCRATCH = 0.4 * GIB  # its smallest tile takes 0.34 GiB
 _BYTES = {0: 4, 1: 2, 2: 4}  # uint, half, float
 _RGB = 12  # bytes of a pixel of three float32 channels
 _CANDIDATES = 2  # OIDN's other modes
+_MOTIONS = 36  # bytes of a pixel: offsets and whether they are known, to the frames within two and back
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
@@ -56,7 +58,7 @@ def parse_size(text: str) -> int:
     return int(float(found[1]) * _UNITS[found[2].upper()])
 
 
-def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: int = 0) -> int:
+def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False) -> int:
     """Bytes that are left for OIDN beside its images.
 
     Args:
@@ -64,13 +66,14 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
         sources: the frame's files.
         settings: of the correction.
         extra: how many images stages need beyond the halves.
+        shot: it is one of a shot's, with its neighbours.
 
     Raises:
         FileError: a file cannot be read.
         FrameError: a file has another size than half a.
         SettingsError: the frame does not fit.
     """
-    found = needs(sources, settings, extra=extra)
+    found = needs(sources, settings, extra=extra, shot=shot)
     needed = _with_denoiser(found)
     stage = max(needed, key=lambda name: needed[name])
     if needed[stage] > limit:
@@ -82,19 +85,40 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
     return int(limit - found.denoise - _OIDN)
 
 
-def fits(limit: int, sources: Sources, settings: Settings, *, extra: int = 0) -> bool:
+def fits(limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False) -> bool:
     """Whether a frame can be corrected within so many bytes; arguments as for :func:`scratch_within`."""
-    return max(_with_denoiser(needs(sources, settings, extra=extra)).values()) <= limit
+    return max(_with_denoiser(needs(sources, settings, extra=extra, shot=shot)).values()) <= limit
+
+
+def reduced(
+    limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False
+) -> tuple[dict[str, Any], list[str]]:
+    """What has to change in the settings for a frame to fit, if that is enough, and a line of each.
+
+    Arguments as for :func:`scratch_within`. Further denoised images go first: a shot's neighbours gain more.
+    """
+    steps: list[dict[str, Any]] = [{}]
+    if settings.candidates != "none":
+        steps.append({"candidates": "none"})
+    if shot:
+        steps += [{**steps[-1], "frame_radius": radius} for radius in reversed(range(settings.frame_radius))]
+    fitting = (s for s in steps if fits(limit, sources, replace(settings, **s), extra=extra, shot=shot))
+    changes = next(fitting, steps[-1])
+    lines = {
+        "candidates": "no further candidates: --maxmem has no room for them",
+        "frame_radius": f"--frame-radius {changes.get('frame_radius')}: --maxmem has no room for more neighbours",
+    }
+    return changes, [lines[name] for name in changes]
 
 
 def _with_denoiser(found: Needs) -> dict[str, float]:
     return dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
 
 
-def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
+def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False) -> Needs:
     """What a frame needs, by the headers of all its files.
 
-    ``extra`` images beyond the halves are held as they are and denoised.
+    ``extra`` images beyond the halves are held as they are and denoised. In a ``shot`` neighbours are held beside it.
     """
     check_alike(sources.paths)
     file, _, layer = sources.a.partition("::")
@@ -114,12 +138,20 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0) -> Needs:
     candidates = 3 * image * further  # of both halves and of their mean
     stored_channels = sum(len(part.channels) for part in parts)
     evidence = pixels * 8 * (1 + further + (1 + further) * (2 + further) // 2) if settings.guard else 0
+    around = 0.0
+    if shot:  # the next frame is read and the last one written meanwhile
+        around = half + held + max(stored, half) + 2 * image + 2 * held
+        if settings.frame_radius and settings.guard:
+            kept = 2 * half + 6 * image + 3 * aids + _MOTIONS * pixels  # also what was gathered and denoised again
+            around += (2 * settings.frame_radius + 2) * kept + 3 * image
+    both, base = 2 * half, _BASE + around
+    correct = both + 3 * image + max(training, image + evidence) + 2 * beyond + candidates
     return Needs(
-        read=_BASE + half + held + max(stored, half) + beyond,
-        denoise=_BASE + 2 * half + max(image + aids, 2 * image) + image + 2 * beyond + candidates,
-        correct=_BASE + _WORK + 2 * half + 3 * image + max(training, image + evidence) + 2 * beyond + candidates,
-        aovs=_of_aovs(pixels, stored_channels, half, held) if sources.aovs not in (None, "none") else 0.0,
-        write=_BASE + _WORK + 2 * image + 2 * held + max(stored, held),  # both halves, and what is made of them
+        read=base + half + held + max(stored, half) + beyond,
+        denoise=base + both + max(image + aids, 2 * image) + image + 2 * beyond + candidates,
+        correct=base + _WORK + correct,
+        aovs=around + _of_aovs(pixels, stored_channels, half, held) if sources.aovs not in (None, "none") else 0.0,
+        write=base + _WORK + 2 * image + 2 * held + max(stored, held),  # both halves, and what is made of them
     )
 
 

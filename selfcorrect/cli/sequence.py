@@ -8,6 +8,7 @@ from typing import Any
 
 from selfcorrect import files
 from selfcorrect.cli import flags, pages
+from selfcorrect.cli.frame import fitted
 from selfcorrect.cli.runner import Denoised, Runner
 from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import FileError, FrameError, SelfcorrectError
@@ -39,6 +40,7 @@ def add(commands: Any) -> None:
         "--save-state", metavar="STATE.safetensors", help="keep the last frame's state here; with ####, that of each"
     )
     parser.add_argument("--fail-fast", action="store_true", help="end with the first frame that fails")
+    flags.add_maxmem(parser)
     pages.add_flag(parser)
     flags.add_aovs(parser)
     flags.add_run_flags(parser)
@@ -58,7 +60,9 @@ def _sequence(options: argparse.Namespace) -> int:
         aovs=options.aovs,
     )
     page = pages.ShotPage.at(options.report, frames)
-    runner = Runner(options, given=options.denoised_a is not None)
+    # the shot is judged by its first frame
+    scratch = options.maxmem and fitted(options, options.maxmem, work.sources(frames[0]), shot=True)
+    runner = Runner(options, given=options.denoised_a is not None, scratch=scratch)
     around = _Around(runner)
     how = shot.Options(
         runner.settings,

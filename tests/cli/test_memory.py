@@ -13,7 +13,7 @@ import pytest
 from helpers.commands import BALANCED, call
 
 from selfcorrect import Settings
-from selfcorrect.cli.memory import GIB, fits, needs, parse_size, scratch_within
+from selfcorrect.cli.memory import GIB, fits, needs, parse_size, reduced, scratch_within
 from selfcorrect.errors import FileError, SettingsError
 from selfcorrect.exr import header as exrheader
 from selfcorrect.files import Sources
@@ -112,6 +112,47 @@ def test_candidates_are_left_out_where_there_is_no_room(tmp_path: Path) -> None:
     assert not fits(6 * GIB, frame, settings)
     assert fits(12 * GIB, frame, settings)
     assert fits(6 * GIB, small, settings)
+
+
+def test_a_shot_takes_fewer_neighbours_where_there_is_no_room(tmp_path: Path) -> None:
+    frame, settings = eight_k(tmp_path, np.float16), Settings.preset("balanced")
+    most = {radius: max(needs(frame, replace(settings, frame_radius=radius), shot=True)) for radius in (0, 1, 2)}
+    assert most[0] < most[1] < most[2]
+    assert max(needs(frame, settings)) < most[0], "the next frame is read and the last one written meanwhile"
+    assert reduced(64 * GIB, frame, settings, shot=True) == ({}, [])
+    without = {r: max(needs(frame, replace(settings, frame_radius=r, candidates="none"), shot=True)) for r in (0, 1)}
+    for radius, bytes_ in without.items():
+        changes, lines = reduced(int(bytes_ + 0.7 * GIB), frame, settings, shot=True)
+        assert changes == {"candidates": "none", "frame_radius": radius}
+        assert lines[1] == f"--frame-radius {radius}: --maxmem has no room for more neighbours"
+
+
+def test_a_shot_takes_no_more_than_is_told(tmp_path: Path) -> None:
+    """Seven frames, each with three neighbours on either side; the peak of the whole command."""
+    size = (500, 1050)
+    for number in range(1, 8):
+        for i, half in enumerate("ab"):
+            write_half(tmp_path / f"{half}.{number:04d}.exr", 10 * number + i, size, np.float16)
+    (tmp_path / "same.py").write_text(
+        "class Same:\n"
+        "    name, features, reads_only = 'same', frozenset({'albedo', 'normal'}), True\n"
+        "    def denoise(self, color, albedo, normal):\n"
+        "        return color.clone()\n"
+    )
+    code = (
+        "import resource, sys; from selfcorrect import cli\n"
+        "code = cli.main(sys.argv[1:]); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss); sys.exit(code)"
+    )
+    names = [str(tmp_path / f"{name}.####.exr") for name in ("a", "b")]
+    command = [sys.executable, "-c", code, "sequence", *names, "-o", str(tmp_path / "out.####.exr")]
+    denoiser = ["--denoiser", f"{tmp_path / 'same.py'}:Same", "--threads", "1", "--frames", "3-5"]
+    result = subprocess.run([*command, *QUICK, *denoiser], capture_output=True, text=True, timeout=300, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "history of 4 frames" in result.stderr or "no history" in result.stderr
+    first = Sources(*(str(tmp_path / f"{half}.0003.exr") for half in "ab"))
+    settings = Settings.preset("balanced", patch=16, steps=1, candidates="none")
+    told = max(needs(first, settings, shot=True))
+    assert 0.4 * told < int(result.stdout) * 1024 < told
 
 
 def test_a_frame_that_does_not_fit_is_refused(tmp_path: Path) -> None:
