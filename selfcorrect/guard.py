@@ -32,6 +32,7 @@ from selfcorrect.pooling import pairs, pooled, taken_off
 __all__ = ["Estimate", "Evidence", "Guarded", "guard", "keep_light_"]
 
 _OUTERMOST = 0.005  # share of the tiles at either end that the verdict pulls in
+_CERTAIN = 1.645  # standard errors: the normal distribution leaves 5 % beyond
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
 _LARGEST_SCALE = 1.02  # of the whole image, to keep its light
@@ -285,7 +286,7 @@ def _estimate(squares: Tensor, size: tuple[int, int], improved: bool) -> tuple[E
 
 
 def _more_than_chance(tiles: Tensor) -> bool:
-    """Whether a mean over tiles is above 0 by more than its standard error, the outermost tiles pulled in.
+    """Whether a mean over tiles is above 0 by more than chance gives in one case of twenty, the outermost pulled in.
 
     One tile with a firefly in its witness can be the whole sum, and then neither it nor its standard error means
     anything: the highest and the lowest half per cent of the tiles count as the next one.
@@ -293,7 +294,7 @@ def _more_than_chance(tiles: Tensor) -> bool:
     ordered = tiles.flatten().sort().values
     cut = int(_OUTERMOST * len(ordered))
     pulled_in = ordered.clamp(float(ordered[cut]), float(ordered[-1 - cut]))
-    return float(pulled_in.mean()) > _standard_error(pulled_in)
+    return float(pulled_in.mean()) > _CERTAIN * _standard_error(pulled_in)
 
 
 def _standard_error(tiles: Tensor) -> float:

@@ -107,7 +107,7 @@ def test_a_network_that_fits_worse_than_a_new_one_is_not_taken() -> None:
 
 
 def test_sequence_is_the_chain_of_single_frames() -> None:
-    settings = Settings.preset("balanced", patch=16, batch=2, steps=6, warm_steps=3, window=7)
+    settings = Settings.preset("balanced", patch=16, batch=2, steps=6, warm_steps=3, window=7, frame_radius=0)
     frames = [make_frame(seed=seed) for seed in range(3)]
     first = correct(frames[0], settings)
     second = correct(frames[1], settings, warm_start=first.network)
@@ -131,6 +131,22 @@ def test_sequence_is_the_chain_of_single_frames() -> None:
     np.testing.assert_array_equal(cold[2].image, correct(frames[2], settings).image)
     key = list(correct_sequence(frames, settings, cold=True, warm_start=first.network))
     assert all(result.start.warm_loss is not None for result in key)
+
+
+def test_sequence_reads_as_far_as_its_histories_reach() -> None:
+    settings = Settings.preset("balanced", patch=16, batch=2, steps=1, window=3)
+    read: list[int] = []
+
+    def reading() -> Iterator[Frame]:
+        for seed in range(6):
+            read.append(seed)
+            yield make_frame(seed=seed)
+
+    results = correct_sequence(reading(), settings, radius=1, denoiser=lambda color, albedo=None, normal=None: color)
+    for ahead in (3, 4, 5, 6, 6, 6):  # a neighbour's neighbour is the last that counts
+        next(results)
+        assert len(read) == ahead
+    assert next(results, None) is None
 
 
 def test_denoised_halves_are_needed() -> None:
