@@ -86,7 +86,7 @@ def _of_frame(tiles: Tensor, size: tuple[int, int], count: int) -> Tensor:
         chance = variance.sqrt() if n.shape[1] > 1 else n[:, 0].abs()
         alpha = _solved(means[0], means[1], nothing, nothing, chance.reshape(-1, 1, 1))
         rest = _left(n, d, alpha.flatten(1))
-        usual = rest.abs().median(1, keepdim=True).values.clamp(min=_FLOOR) / _MEDIAN_OF_NORMAL
+        usual = _median(rest.abs()).clamp(min=_FLOOR) / _MEDIAN_OF_NORMAL
         trust = 1 / (1 + ((rest / (_OUTLYING * usual)) ** 2).amax(0))
     return alpha
 
@@ -137,3 +137,8 @@ def _moments(size: tuple[int, int], nd: Callable[[slice], Tensor], alpha: Tensor
     evidence, around = nd(rows), enlarged_rows(alpha, size, rows)
     count = len(alpha)
     return torch.cat([evidence, around, _left(evidence[:count], evidence[count:], around) ** 2])
+
+
+def _median(values: Tensor) -> Tensor:
+    """Over the last of two dimensions, kept; the lower one of two. By sorting, which is deterministic on any device."""
+    return values.sort(1).values[:, (values.shape[1] - 1) // 2, None]

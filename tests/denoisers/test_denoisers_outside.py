@@ -150,7 +150,7 @@ class TestCommand:
         program = tmp_path / "program"
         program.write_text("neither a script nor a binary")
         program.chmod(0o755)
-        with pytest.raises(DenoiserError, match="program: Exec format error"):
+        with pytest.raises(DenoiserError, match="program: expected a program to run, but got: Exec format error"):
             denoisers.create(f"command:{program} {{color}} {{output}}")(image(4, 6))
 
     @pytest.mark.parametrize(

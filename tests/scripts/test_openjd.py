@@ -73,23 +73,20 @@ def test_chunks_fail_and_go_on(shot: Path) -> None:
     (reason,) = re.findall(r"openjd_fail: (.*)", said)
     assert reason.startswith("frame 4: ")
     assert "shot_b.0004.exr: expected" in reason
-    before = written(shot)
-    assert list(before) == ["shot.0001.exr", "shot.0002.exr", "shot.0003.exr"]
+    assert list(written(shot)) == ["shot.0001.exr", "shot.0002.exr", "shot.0003.exr"]
 
     late.write_bytes(whole)
     code, said = run(shot, Frames="1-5", ChunkSize=2)
     assert code == 0, said
     assert re.findall(r"openjd_status: frame (.*)", said) == [
-        "1 skipped",
-        "2 skipped",
-        "3 skipped",
-        "4 written",
-        "5 written",
+        f"{frame} written"  # frame 4 is a neighbour's neighbour of all
+        for frame in range(1, 6)
     ]
     assert "openjd_fail" not in said
-    after = written(shot)
-    assert list(after) == [f"shot.{frame:04d}.exr" for frame in range(1, 6)]
-    assert {name: after[name] for name in before} == before
+    assert list(written(shot)) == [f"shot.{frame:04d}.exr" for frame in range(1, 6)]
+    code, said = run(shot, Frames="1-5", ChunkSize=2)
+    assert code == 0, said
+    assert re.findall(r"openjd_status: frame (.*)", said) == [f"{frame} skipped" for frame in range(1, 6)]
 
 
 def test_a_key_frame_makes_every_chunk_start_warm(shot: Path) -> None:

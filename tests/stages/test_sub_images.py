@@ -58,7 +58,7 @@ def test_sub_images_count_as_memory(renders: list[str]) -> None:
     with_them, without = (memory.needs(sources, Settings(), extra=count) for count in (4, 0))
     image = 64 * 70 * 12  # bytes
     grown = [one - other for one, other in zip(with_them, without, strict=True)]
-    assert grown == [4 * image, 8 * image, 8 * image, 0]
+    assert grown == [4 * image, 8 * image, 8 * image, 0, 0]
 
 
 def test_sub_images_move_with_the_frame(weight_files: dict[str, str]) -> None:
