@@ -6,6 +6,7 @@ The texts stay where they are raised, beside the values that they tell of; this 
 `tests/scripts/test_error_texts.py` holds the list against it.
 """
 
+import argparse
 import ast
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,4 +63,5 @@ def page() -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     PAGE.write_text(page(), encoding="utf-8")

@@ -64,7 +64,7 @@ def test_sub_images_count_as_memory(renders: list[str]) -> None:
 def test_sub_images_move_with_the_frame(weight_files: dict[str, str]) -> None:
     """A frame elsewhere takes them along, whoever holds them; those that were given stay where they are."""
     frame, subs = make_both()
-    chosen = settings(weight_files, stages="deep-combiner-4", input_scale=1.0)
+    chosen = settings(weight_files, stages="deep-combiner-4", input_scale=1.0, fireflies="keep")
     seen: list[SubImages] = []
 
     class Watched(DeepCombiner4):

@@ -39,7 +39,7 @@ def test_composition_with_the_core_and_the_guard(weight_files: dict[str, str]) -
     small = {"patch": 16, "batch": 2, "steps": 2, "window": 5, "layers": 3}
     chosen = settings(weight_files, stages="deep-combiner,core,neural-james-stein", **small | {"guard": True})
     result = correct(make_frame(), chosen)
-    assert list(result.seconds) == ["deep-combiner", "train", "infer", "neural-james-stein", "guard"]
+    assert list(result.seconds) == ["deep-combiner", "train", "infer", "neural-james-stein", "guard", "fireflies"]
     assert result.image.isfinite().all()
     assert result.estimate is not None
 
