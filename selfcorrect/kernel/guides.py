@@ -1,7 +1,8 @@
 """What the kernel reads: the guide buffers of one half, padded once, so that no border is left to handle."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -87,9 +88,15 @@ class Guides:
         return cls(planes, bottom - top, right - left, margin, terms)
 
     @classmethod
-    def stack(cls, crops: "list[Guides]") -> "Guides":
-        """Guides of one size, below one another."""
-        return replace(crops[0], planes=torch.cat([c.planes for c in crops], 1), stacked=len(crops))
+    def stack(cls, crops: Iterable["Guides"], count: int) -> "Guides":
+        """So many guides of one size, below one another; each may be made when it is asked for, and is let go."""
+        crops = iter(crops)
+        first = next(crops)
+        channels, rows, columns = first.planes.shape
+        planes = first.planes.new_empty(channels, count * rows, columns)
+        for i, crop in enumerate(chain([first], crops)):
+            planes[:, i * rows : (i + 1) * rows] = crop.planes
+        return replace(first, planes=planes, stacked=count)
 
     @property
     def pitch(self) -> int:

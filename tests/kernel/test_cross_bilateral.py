@@ -251,7 +251,7 @@ def test_stacked_crops_are_as_if_alone(backend: str) -> None:
     raw = make_raw(crops[0], "eq10", (1, 4, 8)).float().to(DEVICE)
     corners = torch.tensor([[1, 2]])
     alone = cross_bilateral(crops[1], raw, corners, Window(3), backend=None if DEVICE == "cuda" else backend)
-    stacked = Guides.stack(crops)
+    stacked = Guides.stack(crops, len(crops))
     below = corners + torch.tensor([[stacked.pitch, 0]])
     got = cross_bilateral(stacked, raw, below, Window(3), backend=None if DEVICE == "cuda" else backend)
     assert torch.equal(got, alone)

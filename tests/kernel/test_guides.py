@@ -62,7 +62,7 @@ def test_none_is_a_buffer_that_is_not_there() -> None:
 
 def test_stacked_crops_lie_below_one_another() -> None:
     crops = [make_guides(6, 5, margin=2, seed=seed) for seed in (0, 1, 2)]
-    stacked = Guides.stack(crops)
+    stacked = Guides.stack(crops, len(crops))
     for index, crop in enumerate(crops):
         corner = torch.tensor([[1 + index * stacked.pitch, 2]])
         assert torch.equal(stacked.patches(corner, (4, 3)), crop.patches(torch.tensor([[1, 2]]), (4, 3)))

@@ -81,7 +81,8 @@ def test_patches_of_crops_lie_inside_them() -> None:
     half = frame.halves[0]
     regions = [(0, 0, 40, 40), (20, 50, 60, 90), (10, 10, 50, 50)]
     settings = Settings.preset("balanced", patch=16, steps=1)
-    guides = Guides.stack([Guides.of_half(half._asdict(), margin=9, region=region) for region in regions])
+    crops = (Guides.of_half(half._asdict(), margin=9, region=region) for region in regions)
+    guides = Guides.stack(crops, len(regions))
     seen = set()
     for corners, _ in zip(batches(guides, settings, torch.Generator().manual_seed(0)), range(50), strict=False):
         for row, column in corners.tolist():

@@ -89,7 +89,7 @@ def _training_guides(state: StageImages, settings: Settings, generator: torch.Ge
     def one(half: Half, denoised: Tensor) -> Guides:
         buffers = half._asdict() | {DENOISED.name: denoised}
         cut = partial(Guides.of_half, buffers, margin=margin, scale=state.scale)
-        return Guides.stack([cut(region=region) for region in regions]) if regions else cut()
+        return Guides.stack((cut(region=region) for region in regions), len(regions)) if regions else cut()
 
     return one(state.halves[0], state.images[0]), one(state.halves[1], state.images[1])
 
