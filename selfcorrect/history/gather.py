@@ -5,7 +5,7 @@ otherwise than its surface (a mirror's picture, a shadow, a light that changed) 
 see; the guard, which judges the result against the frame's own denoised image, takes it only where it is true.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -39,16 +39,12 @@ def gathered(
     Returns:
         The half; and by the neighbour's number, the weight of its pixels on average.
     """
-    own, z = features(frame), frame.candidates[0].halves[half]
+    z = frame.candidates[0].halves[half]
     color, total, found = frame.color[half].clone(), torch.ones_like(z[..., :1]), {}
     for number, (other, motion) in neighbours.items():
-        exponent = _unlike(fetched(other.candidates[0].halves[half], motion.offset)[0], z, _RADIANCE)
-        theirs = features(other)
-        for name in (name for name in _WIDTHS if name in own and name in theirs):
-            exponent += (fetched(theirs[name], motion.offset)[0] - own[name]).square().sum(-1) / _WIDTHS[name] ** 2
-        samples, inside = fetched(other.color[half], motion.offset)
-        weight = (torch.exp(-exponent) * (motion.known & inside))[..., None]
-        color += weight * samples
+        theirs = fetched(other.candidates[0].halves[half], motion.offset)
+        weight = _weight(frame, z, other, theirs, motion, _RADIANCE, fetched)
+        color += weight * fetched(other.color[half], motion.offset)
         total += weight
         found[number] = float(weight.mean())
     return color / total, found
@@ -67,23 +63,31 @@ def averaged(
     Returns:
         The image; and by the neighbour's number, the weight of its pixels on average.
     """
-    own, sum_, total, found = features(frame), image.clone(), torch.ones_like(image[..., :1]), {}
+    sum_, total, found = image.clone(), torch.ones_like(image[..., :1]), {}
     for number, (other, motion, their_image) in neighbours.items():
-        moved = warped(their_image, motion.offset)
-        exponent = _unlike(moved, image, _CLEANER)
-        theirs = features(other)
-        for name in (name for name in _WIDTHS if name in own and name in theirs):
-            exponent += (warped(theirs[name], motion.offset) - own[name]).square().sum(-1) / _WIDTHS[name] ** 2
-        inside = fetched(their_image[..., :1], motion.offset)[1]
-        weight = (torch.exp(-exponent) * (motion.known & inside))[..., None]
-        sum_ += weight * moved
+        theirs = warped(their_image, motion.offset)
+        weight = _weight(frame, image, other, theirs, motion, _CLEANER, warped)
+        sum_ += weight * theirs
         total += weight
         found[number] = float(weight.mean())
     return (sum_ / total).clamp(min=0), found
 
 
-def _unlike(fetched_: Tensor, z: Tensor, width: float) -> Tensor:
-    """‖Δz‖² over what is allowed, (H, W)."""
+def _weight(
+    frame: Frame,
+    z: Tensor,
+    other: Frame,
+    theirs: Tensor,
+    motion: Motion,
+    width: float,
+    brought: Callable[[Tensor, Tensor], Tensor],
+) -> Tensor:
+    """Of each pixel of another frame, (H, W, 1): ``theirs`` is its z, brought here, and σ_z is ``width``."""
     darkest = _DARKEST / scale_to_one((z, z)) ** 2
     allowed = width**2 * (darkest + z.square().sum(-1))
-    return (fetched_ - z).square().sum(-1) / allowed.clamp(min=torch.finfo(torch.float32).tiny)
+    exponent = (theirs - z).square().sum(-1) / allowed.clamp(min=torch.finfo(torch.float32).tiny)
+    own, others = features(frame), features(other)
+    for name, bandwidth in _WIDTHS.items():
+        if name in own and name in others:
+            exponent += (brought(others[name], motion.offset) - own[name]).square().sum(-1) / bandwidth**2
+    return (torch.exp(-exponent) * motion.known)[..., None]

@@ -98,10 +98,11 @@ class Histories:
         self._forget(frames)
         frame, frames = frames[number], {n: self._with_aids(n, frame) for n, frame in frames.items()}
         mine, history = self._candidate(number, frames)
-        if not history.found:
+        if self._denoiser is not None and not history.found:
             return frame, history
-        step = 1 if self._denoiser is not None else self._radius
-        around = self._neighbours(number, frames, step)[0]
+        around, left_out = self._neighbours(number, frames, 1 if self._denoiser is not None else self._radius)
+        if not around:
+            return frame, History({}, left_out)
         others = {n: self._candidate(n, frames)[0] for n in around}
         images, found = [], dict[int, float]()
         for which in (0, 1, 2):  # half a, half b, both
@@ -109,7 +110,7 @@ class Histories:
             image, found = averaged(frames[number], _images(mine)[which], given)
             images.append(image)
         if self._denoiser is None:
-            history = history._replace(found={n - number: share for n, share in found.items()})
+            history = History({n - number: share for n, share in found.items()}, left_out)
         return frame.with_candidate(Candidate(NAME, (images[0], images[1]), images[2])), history
 
     def _with_aids(self, number: int, frame: Frame) -> Frame:
@@ -128,9 +129,11 @@ class Histories:
 
     def _gather(self, number: int, frames: Mapping[int, Frame]) -> tuple[Candidate, History]:
         frame, given = frames[number], frames[number].candidates[0]
+        if self._denoiser is None:
+            return given, History()
         around, left_out = self._neighbours(number, frames, self._radius)
-        if self._denoiser is None or not around:
-            return given, History(dict.fromkeys((n - number for n in around), 0.0), left_out)
+        if not around:
+            return given, History({}, left_out)
         neighbours = {n: (frames[n], self._motion(number, n, frames)) for n in around}
         halves, found = [], dict.fromkeys(around, 0.0)
         for i in (0, 1):

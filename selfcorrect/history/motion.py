@@ -22,6 +22,7 @@ __all__ = ["Motion", "available", "between", "features", "fetched", "optical_flo
 _TOLERANCE = 1.5  # pixels that the flow forward and back may miss its start by
 _SHARES = (0.4, 0.2, 0.4)  # of albedo, normal and tone-mapped radiance in the picture that flow is found in
 _LIGHT = (0.5, 0.3, 0.2)  # a direction: shading by it turns normals into grey
+_LEAST_SIDE = 16  # pixels: OpenCV's search fails below
 
 
 class Motion(NamedTuple):
@@ -29,7 +30,7 @@ class Motion(NamedTuple):
 
     Attributes:
         offset: (H, W, 2), x and y in pixels.
-        known: (H, W), whether it is to be believed there.
+        known: (H, W), whether it is to be believed there, and leads to a pixel of the other.
     """
 
     offset: Tensor
@@ -93,9 +94,6 @@ def optical_flow(image: Tensor, other: Tensor) -> Tensor:
     return flow.to(image.device)
 
 
-_LEAST_SIDE = 16  # pixels: OpenCV's search fails below
-
-
 def between(image: Tensor, other: Tensor) -> tuple[Motion, Motion]:
     """Motion from one picture (see :func:`picture`) to another and back, by optical flow.
 
@@ -104,29 +102,36 @@ def between(image: Tensor, other: Tensor) -> tuple[Motion, Motion]:
     forward, backward = optical_flow(image, other), optical_flow(other, image)
 
     def believed(there: Tensor, back: Tensor) -> Motion:
-        returned, inside = fetched(back, there)
-        missed = (there + returned).square().sum(-1)
-        return Motion(there, inside & (missed <= _TOLERANCE**2))
+        missed = (there + fetched(back, there)).square().sum(-1)
+        return Motion(there, _inside(there) & (missed <= _TOLERANCE**2))
 
     return believed(forward, backward), believed(backward, forward)
 
 
-def fetched(image: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels of another frame's (H, W, C) at the nearest places that offsets lead to, and (H, W) whether inside it.
+def fetched(image: Tensor, offset: Tensor) -> Tensor:
+    """Pixels of another frame's (H, W, C) at the nearest places that offsets lead to; beyond its border, the border's.
 
     The nearest pixel, no interpolation: noise stays noise of single pixels, independent of its neighbours.
     """
     height, width = offset.shape[:2]
-    result = image.new_empty(height, width, *image.shape[2:])
-    inside = torch.empty(height, width, dtype=torch.bool, device=image.device)
-    columns = torch.arange(width, device=image.device)
+    result = torch.empty_like(image)
     for rows in bands(height):
-        y = torch.arange(rows.start, rows.stop, device=image.device)[:, None] + offset[rows, :, 1]
-        x = columns + offset[rows, :, 0]
-        y, x = y.round().long(), x.round().long()
-        inside[rows] = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        x, y = _places(offset, rows).round().long().unbind(-1)
         result[rows] = image[y.clamp(0, height - 1), x.clamp(0, width - 1)]
-    return result, inside
+    return result
+
+
+def _inside(offset: Tensor) -> Tensor:
+    """Whether offsets lead to a pixel of the other frame, (H, W)."""
+    x, y = _places(offset, slice(0, offset.shape[0])).round().unbind(-1)
+    return (y >= 0) & (y < offset.shape[0]) & (x >= 0) & (x < offset.shape[1])
+
+
+def _places(offset: Tensor, rows: slice) -> Tensor:
+    """Where rows of a frame lie in the other one, (rows, W, 2), x and y in pixels."""
+    y = torch.arange(rows.start, rows.stop, device=offset.device)
+    x = torch.arange(offset.shape[1], device=offset.device)
+    return torch.stack(torch.meshgrid(y, x, indexing="ij")[::-1], -1) + offset[rows]
 
 
 def warped(image: Tensor, offset: Tensor) -> Tensor:
@@ -138,10 +143,7 @@ def warped(image: Tensor, offset: Tensor) -> Tensor:
     size = torch.tensor([width, height], device=image.device)
     result = torch.empty_like(image)
     source = image.permute(2, 0, 1)[None]
-    columns = torch.arange(width, device=image.device)
     for rows in bands(height):
-        y = torch.arange(rows.start, rows.stop, device=image.device)
-        place = torch.stack(torch.meshgrid(y, columns, indexing="ij")[::-1], -1) + offset[rows]
-        grid = (2 * place + 1) / size - 1
+        grid = (2 * _places(offset, rows) + 1) / size - 1
         result[rows] = F.grid_sample(source, grid[None], "bicubic", "border", align_corners=False)[0].permute(1, 2, 0)
     return result

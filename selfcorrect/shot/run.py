@@ -294,8 +294,6 @@ class _Run:
         if isinstance(loaded, Exception):
             self._fail(frame, loaded)
             return
-        if not self.options.reach:
-            self._around.clear()  # nothing holds the frame longer than the work on it
         try:
             done = self.work(self._job(frame, output, loaded, fetched.recipe))
         except Exception as error:
@@ -315,6 +313,8 @@ class _Run:
             for n, read in self._around.items()
             if isinstance(read, Exception)
         }
+        if not self.options.reach:
+            self._around.clear()  # nothing holds the frame longer than the work on it
         return Job(frame, output, loaded, made, link, lambda: self._flush(wait=False), around, missing)
 
     def _exists(self, frame: int) -> bool:

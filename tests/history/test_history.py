@@ -1,13 +1,14 @@
 """A frame's halves with the samples of its neighbours: what helps, what is left alone, what is refused."""
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
 import denoisers
 from selfcorrect import Frame
 from selfcorrect.history import with_history
-from selfcorrect.history.motion import fetched
+from selfcorrect.history.motion import between, fetched
 
 SIZE, STEP = (64, 96), 3  # pixels that the picture moves to the left from frame to frame
 
@@ -115,7 +116,14 @@ def test_without_a_denoiser_the_denoised_images_are_averaged() -> None:
 def test_pixels_are_fetched_and_not_mixed() -> None:
     image = torch.arange(12.0).reshape(3, 4, 1)
     offset = torch.tensor([1.4, -0.6]).expand(3, 4, 2)
-    got, inside = fetched(image, offset)
-    assert np.array_equal(got[1, :, 0], [1, 2, 3, 3])
-    assert inside[1].tolist() == [True, True, True, False]
-    assert not inside[0].any()
+    assert np.array_equal(fetched(image, offset)[1, :, 0], [1, 2, 3, 3])
+
+
+def test_motion_out_of_the_picture_is_not_believed() -> None:
+    """A pan to the left: what enters on one side has no place in the other frame."""
+    wide = texture().mean(-1)
+    motion, back = between(wide[:, 30:126].contiguous(), wide[:, 42:138].contiguous())
+    assert float(motion.offset[..., 0].median()) == pytest.approx(-12, abs=0.5)
+    assert not motion.known[:, :11].any()
+    assert motion.known[:, 20:].float().mean() > 0.7
+    assert not back.known[:, -11:].any()

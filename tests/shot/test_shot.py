@@ -60,6 +60,21 @@ def test_after_a_cut_nothing_depends_on_what_was_before(shot_folder: Path, seque
     assert one["x.0004.exr"] == two["x.0004.exr"]
 
 
+def test_where_a_chunk_is_cut_decides_nothing(tmp_path: Path, sequence: Run) -> None:
+    """A frame sees the same neighbours in the middle of a run and alone: files beyond a chunk's ends are read."""
+    albedo = np.random.default_rng(0).random((24, 30)).astype(np.float16)
+    write_shot(tmp_path, 8, **dict.fromkeys(("albedo.R", "albedo.G", "albedo.B"), albedo))
+    _, _, frames = sequence(arguments(tmp_path, "--cold", last=8))
+    assert [len(f["history"]["found"]) for f in frames] == [2, 3, 4, 4, 4, 4, 3, 2]
+    whole = outputs(tmp_path / "out")
+    for first, last in ((4, 4), (5, 6)):
+        chunk = [f"{first}-{last}" if a == "1-8" else a for a in arguments(tmp_path, "--cold", last=8, out="chunk")]
+        assert sequence(chunk)[0] == 0
+    for name, written in outputs(tmp_path / "chunk").items():
+        assert written == whole[name]
+    assert len(outputs(tmp_path / "chunk")) == 3
+
+
 class TestSkipExisting:
     """What is there, whole, and made the same way is left alone; all else is made again."""
 
