@@ -34,7 +34,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from selfcorrect.buffers import COLOR, FEATURES
-from selfcorrect.frame import Frame, checked, mean, prefiltered
+from selfcorrect.frame import Frame, checked, mean
 from selfcorrect.guard import Evidence, guard
 from selfcorrect.image.bands import average, bands, enlarged_rows, tile_means, widened
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
@@ -101,14 +101,11 @@ def denoiser_of(frame: Frame, denoiser: Callable[..., Any]) -> Denoise:
             return denoised.denoised, mean(denoised.denoised)
 
         return both
-    guides = [
-        prefiltered(denoiser, *(None if pair is None else choose(pair) for pair in (frame.albedo, frame.normal)))
-        for choose in (lambda pair: pair[0], lambda pair: pair[1], mean)
-    ]
+    aids = tuple(frame.aids_for(denoiser))
 
     def each(color: Pair) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        images = [denoiser(image, **beside) for image, beside in zip((*color, mean(color)), guides, strict=True)]
-        a, b, full = (image.clamp(min=0) for image in images)
+        images = [denoiser(image, **beside) for image, beside in zip((mean(color), *color), aids, strict=True)]
+        full, a, b = (image.clamp(min=0) for image in images)
         return (a, b), full
 
     return each

@@ -69,20 +69,12 @@ def with_candidates(frame: Frame, denoisers: Mapping[str, Denoiser], *, every: b
 
 def with_candidate(frame: Frame, name: str, denoiser: Denoiser) -> Frame:
     """The frame with one candidate more: its halves and their mean, denoised by another denoiser."""
-    a, b = frame.halves
-    images = [
-        torch.as_tensor(denoiser(color, **prefiltered(denoiser, albedo, normal))).clamp(min=0)
-        for color, albedo, normal in (
-            (a.color, a.albedo, a.normal),
-            (b.color, b.albedo, b.normal),
-            (mean((a.color, b.color)), _mean(a.albedo, b.albedo), _mean(a.normal, b.normal)),
-        )
-    ]
-    return frame.with_candidate(Candidate(name, (images[0], images[1]), images[2]))
-
-
-def _mean(a: Tensor | None, b: Tensor | None) -> Tensor | None:
-    return None if a is None or b is None else mean((a, b))
+    colors = (mean(frame.color), *frame.color)
+    full, a, b = (
+        torch.as_tensor(denoiser(color, **aids)).clamp(min=0)
+        for color, aids in zip(colors, frame.aids_for(denoiser), strict=True)
+    )
+    return frame.with_candidate(Candidate(name, (a, b), full))
 
 
 def _crops(size: tuple[int, int]) -> list[Region]:

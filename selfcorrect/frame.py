@@ -1,6 +1,6 @@
 """The half buffers of one frame: shapes and values are checked and repaired once, here."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -194,8 +194,12 @@ class Frame:
     def with_aids(self, denoiser: Callable[..., Any]) -> "Frame":
         """This frame with what the denoiser is given beside the colours, for images that are to be denoised later."""
         frame = self._copy()
-        object.__setattr__(frame, "aids", tuple(self._aids(denoiser, part) for part in (0, 1, 2)))
+        object.__setattr__(frame, "aids", tuple(self.aids_for(denoiser)))
         return frame
+
+    def aids_for(self, denoiser: Callable[..., Any]) -> Iterator[dict[str, Any]]:
+        """What a denoiser is given beside the colour of both halves together, of half a and of half b, one by one."""
+        return (self._aids(denoiser, part) for part in (0, 1, 2))
 
     def _aids(self, denoiser: Callable[..., Any], part: int) -> dict[str, Any]:
         """What goes with the colour of both halves together, 0, or of half a or b, 1 or 2."""

@@ -11,6 +11,7 @@ from selfcorrect import exr, metrics
 from selfcorrect.cli.terminal import answer, show
 from selfcorrect.errors import FileError, FrameError
 from selfcorrect.exr.limits import check_alike
+from selfcorrect.frame import mean
 from selfcorrect.history.motion import available, between, warped
 from selfcorrect.shot.framerange import fill, there
 
@@ -48,16 +49,14 @@ def _frames(options: argparse.Namespace) -> Iterator[_Frame]:
     if not numbers:
         raise FileError(f"{options.image}: expected the frames of a shot, but got no such file")
     for number in numbers:
-        given = (options.image, options.reference, options.reference_b, options.weight)
-        paths = [None if name is None else fill(name, number) for name in given]
-        check_alike([path for path in paths if path])
-        image, a, b, weight = (
-            None if path is None else torch.from_numpy(exr.load_half(path).buffers["color"]) for path in paths
-        )
-        assert image is not None
-        assert a is not None
-        b = a if b is None else b
-        yield _Frame(number, image, (a, b), (a + b) / 2 if weight is None else weight)
+        second = options.reference if options.reference_b is None else options.reference_b
+        image, *paths = (fill(name, number) for name in (options.image, options.reference, second))
+        if options.weight is not None:
+            paths.append(fill(options.weight, number))
+        check_alike([image, *paths])
+        a, b, *smooth = (torch.from_numpy(exr.load_half(path).buffers["color"]) for path in paths)
+        weight = smooth[0] if smooth else mean((a, b))
+        yield _Frame(number, torch.from_numpy(exr.load_picture(image)[0]), (a, b), weight)
 
 
 def _errors(name: str, frame: _Frame) -> dict[str, float]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import denoisers
 from selfcorrect.cli.help import Expert
+from selfcorrect.cli.terminal import show
 from selfcorrect.settings import Settings
 
 __all__ = ["add"]
@@ -46,7 +47,7 @@ def _completion(options: argparse.Namespace, parsers: dict[str, argparse.Argumen
         values="\n".join(f'    {flag}) words="{" ".join(known)}" ;;' for flag, known in values.items()),
         flags="\n".join(f'            {name}) words="{" ".join(known)}" ;;' for name, known in flags.items()),
     )
-    print(script if options.shell == "bash" else f"{_ZSH}\n{script}")
+    show(*(script if options.shell == "bash" else f"{_ZSH}\n{script}").splitlines())
 
 
 def _flags(parser: argparse.ArgumentParser) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 from selfcorrect import exr, files
 from selfcorrect.cli import flags, halves, memory, pages
 from selfcorrect.cli.runner import Runner
-from selfcorrect.cli.terminal import EndOnInterrupt, answer, log
+from selfcorrect.cli.terminal import EndOnInterrupt, answer
 from selfcorrect.facts import Written
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
@@ -43,23 +43,6 @@ def _frame(options: argparse.Namespace) -> None:
         answer(written.to_dict())
 
 
-def fitted(
-    options: argparse.Namespace, maxmem: str, sources: files.Sources, *, extra: int = 0, shot: bool = False
-) -> int:
-    """Change the settings in ``options`` to what there is room for, and tell of it.
-
-    Returns:
-        Bytes that are left for OIDN.
-    """
-    limit = memory.parse_size(maxmem)
-    changes, lines = memory.reduced(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
-    for name, value in changes.items():
-        setattr(options, name, value)
-    for line in lines:
-        log(line)
-    return memory.scratch_within(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
-
-
 def correct_files(
     options: argparse.Namespace,
     sources: files.Sources,
@@ -73,11 +56,8 @@ def correct_files(
     result.
     """
     start = time.perf_counter()
-    scratch = None
-    if maxmem is not None:
-        settings = flags.settings_of(options)
-        extra = sum(len(paths) for paths in flags.extra_files(options, settings).values())
-        scratch = fitted(options, maxmem, sources, extra=extra)
+    extra = sum(len(paths) for paths in flags.extra_files(options, flags.settings_of(options)).values())
+    scratch = memory.fitted(options, maxmem, sources, extra=extra)
     runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
     remove_abandoned(exr.check_target(output).parent)
     with EndOnInterrupt() as stop:

@@ -3,6 +3,7 @@
 import argparse
 from typing import Any, NoReturn
 
+from selfcorrect.cli.terminal import show
 from selfcorrect.errors import SettingsError
 
 __all__ = ["Expert", "Parser", "add_help_all"]
@@ -49,7 +50,7 @@ class Parser(argparse.ArgumentParser):
 class _HelpAll(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         assert isinstance(parser, Parser)
-        print(parser.format_help_all(), end="")
+        show(*parser.format_help_all().splitlines())
         parser.exit()
 
 

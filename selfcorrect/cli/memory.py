@@ -4,6 +4,7 @@ What is counted is what is held for every pixel; `tests/cli/test_memory.py` hold
 command.
 """
 
+import argparse
 import math
 import re
 from dataclasses import replace
@@ -13,6 +14,8 @@ import torch
 
 from denoisers.host import FEATURES as DENOISER_FEATURES
 from selfcorrect.buffers import FEATURES, INPUTS
+from selfcorrect.cli import flags
+from selfcorrect.cli.terminal import log
 from selfcorrect.errors import SettingsError
 from selfcorrect.exr import channels
 from selfcorrect.exr.file import headers
@@ -83,6 +86,25 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
             f"(most of it to {stage}), but got {limit / GIB:.1f}G"
         )
     return int(limit - found.denoise - _OIDN)
+
+
+def fitted(
+    options: argparse.Namespace, maxmem: str | None, sources: Sources, *, extra: int = 0, shot: bool = False
+) -> int | None:
+    """Change the settings in ``options`` to what there is room for, and tell of it.
+
+    Returns:
+        Bytes that are left for OIDN; None where ``maxmem`` sets no bound.
+    """
+    if maxmem is None:
+        return None
+    limit = parse_size(maxmem)
+    changes, lines = reduced(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
+    for name, value in changes.items():
+        setattr(options, name, value)
+    for line in lines:
+        log(line)
+    return scratch_within(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
 
 
 def fits(limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False) -> bool:

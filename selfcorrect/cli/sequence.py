@@ -7,8 +7,7 @@ from functools import partial
 from typing import Any
 
 from selfcorrect import files
-from selfcorrect.cli import flags, pages
-from selfcorrect.cli.frame import fitted
+from selfcorrect.cli import flags, memory, pages
 from selfcorrect.cli.runner import Denoised, Runner
 from selfcorrect.cli.terminal import answer, log
 from selfcorrect.errors import FileError, FrameError, SelfcorrectError
@@ -60,8 +59,7 @@ def _sequence(options: argparse.Namespace) -> int:
         aovs=options.aovs,
     )
     page = pages.ShotPage.at(options.report, frames)
-    # the shot is judged by its first frame
-    scratch = options.maxmem and fitted(options, options.maxmem, work.sources(frames[0]), shot=True)
+    scratch = memory.fitted(options, options.maxmem, work.sources(frames[0]), shot=True)  # all are like the first
     runner = Runner(options, given=options.denoised_a is not None, scratch=scratch)
     around = _Around(runner)
     how = shot.Options(
@@ -130,7 +128,7 @@ class _Around:
         if not self.reach:
             return self._runner.denoise(job.loaded, began)
         self._known = {n: known for n, known in self._known.items() if n in job.around}
-        for n in job.around.keys() - self._known.keys():
+        for n in sorted(job.around.keys() - self._known.keys()):
             self._known[n] = self._denoise(job.around[n])
         mine = self._known[job.frame]
         if isinstance(mine, SelfcorrectError):

@@ -8,7 +8,7 @@ from itertools import zip_longest
 from typing import Any
 
 from selfcorrect.cli import flags
-from selfcorrect.cli.terminal import answer
+from selfcorrect.cli.terminal import answer, show
 from selfcorrect.settings import Settings
 
 __all__ = ["add"]
@@ -36,7 +36,7 @@ def _settings(options: argparse.Namespace) -> None:
     rows += [(f.name, _shown(getattr(settings, f.name)), _meaning(f), f.metadata["source"]) for f in fields(Settings)]
     name, value = (max(len(row[i]) for row in rows) for i in (0, 1))
     widths = name, value, width - name - value - _SOURCE - 6, _SOURCE
-    print("\n".join(line for row in rows for line in _lines(row, widths)))
+    show(*(line for row in rows for line in _lines(row, widths)))
 
 
 def _shown(value: Any) -> str:

@@ -51,10 +51,9 @@ def sources(folder: Path, size: tuple[int, int] = (30, 40), dtype: type = np.flo
     return Sources(*(write_half(folder / f"{half}.exr", seed, size, dtype) for seed, half in enumerate("ab")))
 
 
-def test_the_command_takes_no_more_than_is_told(tmp_path: Path) -> None:
-    """The peak of the whole command; a denoiser that takes nothing beside its images."""
-    frame, settings = sources(tmp_path, SIZE), Settings.preset("balanced", patch=16, steps=1, candidates="none")
-    (tmp_path / "same.py").write_text(
+def peak(folder: Path, *arguments: str) -> tuple[int, str]:
+    """Bytes at the peak of a command whose denoiser takes nothing beside its images, and what it told."""
+    (folder / "same.py").write_text(
         "class Same:\n"
         "    name, features, reads_only = 'same', frozenset({'albedo', 'normal'}), True\n"
         "    def denoise(self, color, albedo, normal):\n"
@@ -64,13 +63,17 @@ def test_the_command_takes_no_more_than_is_told(tmp_path: Path) -> None:
         "import resource, sys; from selfcorrect import cli\n"
         "code = cli.main(sys.argv[1:]); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss); sys.exit(code)"
     )
-    denoiser = ["--denoiser", f"{tmp_path / 'same.py'}:Same", "--threads", "1"]
-    command = [sys.executable, "-c", code, "frame", frame.a, frame.b, "-o", str(tmp_path / "out.exr")]
-    result = subprocess.run([*command, *QUICK, *denoiser], capture_output=True, text=True, timeout=300, check=False)
+    denoiser = ["--denoiser", f"{folder / 'same.py'}:Same", "--threads", "1"]
+    command = [sys.executable, "-c", code, *arguments, *QUICK, *denoiser]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == 0, result.stderr
-    peak = int(result.stdout) * 1024
+    return int(result.stdout) * 1024, result.stderr
+
+
+def test_the_command_takes_no_more_than_is_told(tmp_path: Path) -> None:
+    frame, settings = sources(tmp_path, SIZE), Settings.preset("balanced", patch=16, steps=1, candidates="none")
     told = max(needs(frame, settings))
-    assert 0.4 * told < peak < told
+    assert 0.4 * told < peak(tmp_path, "frame", frame.a, frame.b, "-o", str(tmp_path / "out.exr"))[0] < told
 
 
 def test_aovs_are_counted(tmp_path: Path) -> None:
@@ -133,26 +136,13 @@ def test_a_shot_takes_no_more_than_is_told(tmp_path: Path) -> None:
     for number in range(1, 8):
         for i, half in enumerate("ab"):
             write_half(tmp_path / f"{half}.{number:04d}.exr", 10 * number + i, size, np.float16)
-    (tmp_path / "same.py").write_text(
-        "class Same:\n"
-        "    name, features, reads_only = 'same', frozenset({'albedo', 'normal'}), True\n"
-        "    def denoise(self, color, albedo, normal):\n"
-        "        return color.clone()\n"
-    )
-    code = (
-        "import resource, sys; from selfcorrect import cli\n"
-        "code = cli.main(sys.argv[1:]); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss); sys.exit(code)"
-    )
-    names = [str(tmp_path / f"{name}.####.exr") for name in ("a", "b")]
-    command = [sys.executable, "-c", code, "sequence", *names, "-o", str(tmp_path / "out.####.exr")]
-    denoiser = ["--denoiser", f"{tmp_path / 'same.py'}:Same", "--threads", "1", "--frames", "3-5"]
-    result = subprocess.run([*command, *QUICK, *denoiser], capture_output=True, text=True, timeout=300, check=False)
-    assert result.returncode == 0, result.stderr
-    assert "history of 4 frames" in result.stderr or "no history" in result.stderr
+    names = [str(tmp_path / f"{name}.####.exr") for name in ("a", "b", "out")]
+    taken, log = peak(tmp_path, "sequence", *names[:2], "-o", names[2], "--frames", "3-5")
+    assert "history of 4 frames" in log or "no history" in log
     first = Sources(*(str(tmp_path / f"{half}.0003.exr") for half in "ab"))
     settings = Settings.preset("balanced", patch=16, steps=1, candidates="none")
     told = max(needs(first, settings, shot=True))
-    assert 0.4 * told < int(result.stdout) * 1024 < told
+    assert 0.4 * told < taken < told
 
 
 def test_a_frame_that_does_not_fit_is_refused(tmp_path: Path) -> None:
