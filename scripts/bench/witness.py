@@ -1,0 +1,101 @@
+"""Does the witness tell the truth: what the core changed in the halves, by the other half and by references.
+
+    .venv/bin/python scripts/bench/witness.py ../shared/frames [--frames NAME ...] [--spp 64] [--features own mean]
+
+Half b judges what was made of half a, so its noise must not be in there. The script trains on a frame whose halves keep
+their own G-buffers (``own``, what the tool does) or both get the mean of the two (``mean``, which is less noisy but
+brings half b's noise into half a's correction). It prints the change of the halves' relative squared error, as a share
+of the denoised halves' error, by the references and by the witness, their difference with its standard error over tiles
+of 16 pixels (negative: the witness promises what is not there), and the relMSE of the core's full image, before the
+guard, over that of the denoised one.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from quality import ROLES, load
+from torch import Tensor
+
+import denoisers
+from selfcorrect import Frame, Settings, metrics, stages
+from selfcorrect.image.bands import tile_means
+from selfcorrect.image.exposure import scale_to_one
+from selfcorrect.stages.images import StageImages
+from selfcorrect.stages.stage import Work
+
+_DARKEST = 0.01  # squared radiance, as in the metric
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--frames", nargs="*", help="names; by default all in the folder")
+    parser.add_argument("--spp", type=int, nargs="*", default=[64])
+    parser.add_argument("--features", nargs="*", choices=["own", "mean"], default=["own", "mean"])
+    parser.add_argument("--denoiser", default="oidn")
+    parser.add_argument("--preset", default="balanced")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    print("| frame | spp | G-buffers | change by references | by the witness | difference ± s.e. | full image |")
+    print("|---|---|---|---|---|---|---|")
+    for name in options.frames or sorted({path.name.split("_")[0] for path in options.folder.glob("*_ref_A.exr")}):
+        for spp in options.spp:
+            frame, references = load(options.folder, name, spp)
+            frame = frame.denoise(denoisers.create(options.denoiser, threads=options.threads))
+            for features in options.features:
+                cells = row(options.preset, frame, references, features)
+                print(f"| {name} | {spp} | {features} | {cells} |", flush=True)
+
+
+def row(preset: str, frame: Frame, references: list[np.ndarray], features: str) -> str:
+    """The cells of one training."""
+    if features == "mean":
+        frame = with_mean_features(frame)
+    state = core(frame, Settings.preset(preset))
+    reference_a, reference_b, smooth = (torch.as_tensor(image) for image in references)
+    true, told = changes(frame, state.images, (reference_a + reference_b) / 2, smooth)
+    error = (told - true).std() / len(true) ** 0.5
+    ratio = metrics.relmse(state.full, *references) / metrics.relmse(frame.denoised_full, *references)
+    return f"{true.mean():+.3f} | {told.mean():+.3f} | {(told - true).mean():+.3f} ± {error:.3f} | {ratio:.3f}"
+
+
+def with_mean_features(frame: Frame) -> Frame:
+    """Both halves with the mean of their G-buffers, and with the denoised images they had."""
+    pairs = {role: getattr(frame, role) for role in ROLES if role != "color" and getattr(frame, role) is not None}
+    means = {role: ((a + b) / 2,) * 2 for role, (a, b) in pairs.items()}
+    return Frame(color=frame.color, **means, denoised=frame.denoised, denoised_full=frame.denoised_full)
+
+
+def core(frame: Frame, settings: Settings) -> StageImages:
+    """What the settings' stages make of a frame, without the guard."""
+    given = frame.candidates[0]
+    state = StageImages.of(frame.halves, given, scale_to_one(given.halves))
+    for stage in stages.opened(settings):
+        state = stage.run(state, Work()).state
+    return state
+
+
+def changes(frame: Frame, corrected: tuple[Tensor, Tensor], reference: Tensor, smooth: Tensor) -> tuple[Tensor, Tensor]:
+    """Tiles' change of the halves' error, by the references and by the witness, over the denoised halves' error."""
+    given = frame.candidates[0].halves
+    weight = 1 / (smooth.double().mean(-1) ** 2 + _DARKEST)
+
+    def error(image: Tensor, truth: Tensor, rows: slice) -> Tensor:
+        return weight[rows] * ((image[rows].double() - truth[rows].double()) ** 2).mean(-1)
+
+    def over_tiles(truths: tuple[Tensor, Tensor], images: tuple[Tensor, Tensor]) -> Tensor:
+        pairs = list(zip(images, truths, strict=True))
+        return tile_means(len(smooth), lambda rows: sum(error(*pair, rows) for pair in pairs)[None] / 2).flatten()
+
+    denoised = over_tiles((reference, reference), given)
+    true = over_tiles((reference, reference), corrected) - denoised
+    witnesses = frame.color[::-1]
+    told = over_tiles(witnesses, corrected) - over_tiles(witnesses, given)
+    return true / denoised.mean(), told / denoised.mean()
+
+
+if __name__ == "__main__":
+    main()
