@@ -3,11 +3,11 @@
     .venv/bin/python scripts/bench/witness.py ../shared/frames [--frames NAME ...] [--spp 64] [--features own mean]
 
 Half b judges what was made of half a, so its noise must not be in there. The script trains on a frame whose halves keep
-their own G-buffers (``own``, what the tool does) or both get the mean of the two (``mean``, which is less noisy but
-brings half b's noise into half a's correction). It prints the change of the halves' relative squared error, as a share
-of the denoised halves' error, by the references and by the witness, their difference with its standard error over tiles
-of 16 pixels (negative: the witness promises what is not there), and the relMSE of the core's full image, before the
-guard, over that of the denoised one.
+their own G-buffers (``own``, what the tool does), or both get the mean of the two (``mean``, which is less noisy but
+brings half b's noise into half a's correction), or have albedo and normal denoised by OIDN (``prefiltered``). It prints
+the change of the halves' relative squared error, as a share of the denoised halves' error, by the references and by the
+witness, their difference with its standard error over tiles of 16 pixels (negative: the witness promises what is not
+there), and the relMSE of the core's full image, before the guard, over that of the denoised one.
 """
 
 import argparse
@@ -19,6 +19,7 @@ from quality import ROLES, load
 from torch import Tensor
 
 import denoisers
+from denoisers.oidn import PrefilteringOidn
 from selfcorrect import Frame, Settings, metrics, stages
 from selfcorrect.image.bands import tile_means
 from selfcorrect.image.exposure import scale_to_one
@@ -33,7 +34,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--frames", nargs="*", help="names; by default all in the folder")
     parser.add_argument("--spp", type=int, nargs="*", default=[64])
-    parser.add_argument("--features", nargs="*", choices=["own", "mean"], default=["own", "mean"])
+    parser.add_argument("--features", nargs="*", choices=FEATURES, default=list(FEATURES))
     parser.add_argument("--denoiser", default="oidn")
     parser.add_argument("--preset", default="balanced")
     parser.add_argument("--threads", type=int, default=1)
@@ -52,8 +53,8 @@ def main() -> None:
 
 def row(preset: str, frame: Frame, references: list[np.ndarray], features: str) -> str:
     """The cells of one training."""
-    if features == "mean":
-        frame = with_mean_features(frame)
+    pairs = FEATURES[features](frame)
+    frame = Frame(color=frame.color, **pairs, denoised=frame.denoised, denoised_full=frame.denoised_full)
     state = core(frame, Settings.preset(preset))
     reference_a, reference_b, smooth = (torch.as_tensor(image) for image in references)
     true, told = changes(frame, state.images, (reference_a + reference_b) / 2, smooth)
@@ -62,11 +63,25 @@ def row(preset: str, frame: Frame, references: list[np.ndarray], features: str) 
     return f"{true.mean():+.3f} | {told.mean():+.3f} | {(told - true).mean():+.3f} ± {error:.3f} | {ratio:.3f}"
 
 
-def with_mean_features(frame: Frame) -> Frame:
-    """Both halves with the mean of their G-buffers, and with the denoised images they had."""
-    pairs = {role: getattr(frame, role) for role in ROLES if role != "color" and getattr(frame, role) is not None}
-    means = {role: ((a + b) / 2,) * 2 for role, (a, b) in pairs.items()}
-    return Frame(color=frame.color, **means, denoised=frame.denoised, denoised_full=frame.denoised_full)
+def features_of(frame: Frame) -> dict[str, tuple[Tensor, Tensor]]:
+    """A frame's G-buffers by name, of both halves."""
+    return {role: getattr(frame, role) for role in ROLES if role != "color" and getattr(frame, role) is not None}
+
+
+def mean(frame: Frame) -> dict[str, tuple[Tensor, Tensor]]:
+    """The mean of both halves' G-buffers, for both."""
+    return {role: ((a + b) / 2,) * 2 for role, (a, b) in features_of(frame).items()}
+
+
+def prefiltered(frame: Frame) -> dict[str, tuple[Tensor, Tensor]]:
+    """Each half's G-buffers, albedo and normal denoised by OIDN, as its accurate mode does it."""
+    filter_ = PrefilteringOidn(torch.get_num_threads())
+    pairs = features_of(frame)
+    clean = [filter_.prefilter(*(pairs[role][half] for role in ("albedo", "normal"))) for half in (0, 1)]
+    return pairs | dict(zip(("albedo", "normal"), zip(*clean, strict=True), strict=True))
+
+
+FEATURES = {"own": features_of, "mean": mean, "prefiltered": prefiltered}
 
 
 def core(frame: Frame, settings: Settings) -> StageImages:
