@@ -16,15 +16,16 @@ The predictions assume, and nobody has measured:
 
 import argparse
 import json
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any
 
 import torch
 import triton
-from gpu_variants import Variant, programs_together, variants
+from gpu_variants import EVERYTHING, LARGEST_SHARED, Variant, programs_together, unfit, variants
 from kernel import ALL, best, make_guides
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -152,7 +153,7 @@ def predicted(card: Card, preset: str, size: tuple[int, int], table: list[Varian
     settings = Settings.preset(preset)
     taps = settings.window**2 / settings.taps_every
     loss, forward = (
-        next(v for v in table if (v.target, v.mode, v.buffers, v.window) == (card.target, mode, "y z ρ n v", 19))
+        next(v for v in table if (v.target, v.mode, v.buffers, v.window) == (card.target, mode, EVERYTHING, 19))
         for mode in ("LOSS", "FORWARD")
     )
 
@@ -247,15 +248,34 @@ def a_frame(size: tuple[int, int]) -> Frame:
     return Frame(color=pair(), denoised=pair(), albedo=pair(), normal=pair(), visibility=pair(1))
 
 
-def print_table(table: list[Variant]) -> None:
+def print_table(table: Iterable[Variant]) -> list[Variant]:
+    """Each row as soon as it is compiled."""
     print("| sm | mode | buffers | window | taps | Eq. | registers | spilled | shared | warps | loop | FMA | loads |")
     print("|---:|---|---|---:|---|---|---:|---:|---:|---:|---:|---:|---:|")
+    rows = []
     for v in table:
+        rows.append(v)
         taps = "all" if v.every == 1 else f"1 in {v.every}"
         print(
             f"| {v.target} | {v.mode.lower()} | {v.buffers} | {v.window} | {taps} | {v.combination[2:]} "
             f"| {v.registers} | {v.spilled} | {v.shared} | {gpu.WARPS * programs_together(v)} "
-            f"| {v.instructions} | {v.multiply_adds} | {v.loads} |"
+            f"| {v.instructions} | {v.multiply_adds} | {v.loads} |",
+            flush=True,
+        )
+    return rows
+
+
+def print_summary(table: list[Variant]) -> None:
+    """The worst of each target and mode."""
+    print("\n| sm | mode | variants | registers | spilled | shared | warps |\n|---:|---|---:|---:|---:|---:|---:|")
+    for target, mode in sorted({(v.target, v.mode) for v in table}):
+        of = [v for v in table if (v.target, v.mode) == (target, mode)]
+        registers = sorted(v.registers for v in of)
+        spilled, shared = max(v.spilled for v in of), max(v.shared for v in of)
+        warps = gpu.WARPS * min(map(programs_together, of))
+        print(
+            f"| {target} | {mode.lower()} | {len(of)} | {registers[0]} to {registers[-1]} | {spilled} | {shared} "
+            f"| {warps} or more |"
         )
 
 
@@ -293,12 +313,14 @@ def main() -> None:
     parser.add_argument("--no-measurement", action="store_true", help="also where there is a device")
     parser.add_argument("--no-cpu", action="store_true", help="do not time the CPU beside the device")
     options = parser.parse_args()
-    table = variants(few=options.few)
     if options.json:
-        print(json.dumps([asdict(variant) for variant in table]))
+        print(json.dumps([asdict(variant) for variant in variants(few=options.few)]))
         return
     print(f"Triton {triton.__version__}, torch {torch.__version__}\n")
-    print_table(table)
+    table = print_table(variants(few=options.few))
+    print_summary(table)
+    if bad := unfit(table):
+        sys.exit(f"expected variants without spills and of at most {LARGEST_SHARED} shared bytes, but got {bad}")
     print_predictions(table)
     if torch.cuda.is_available() and not options.no_measurement:
         print_measurements(torch.device("cuda"), cpu_too=not options.no_cpu)
