@@ -26,6 +26,7 @@ BUFFERS = {
 """What a frame may have, by symbols of Eq. 10: each buffer that need not be there, there and absent."""
 
 EVERYTHING = "y z ρ n v"
+_OTHERS = ((19, 1, "eq3"), (19, 4, "eq10"), (1, 1, "eq10"), (7, 1, "eq10"), (31, 1, "eq10"))
 LARGEST_SHARED = 48 << 10  # bytes of a program, on every card and without asking for more
 
 UNUSED = {"FORWARD": ("gradient", "target", "weight"), "BACKWARD": ("target", "weight"), "LOSS": ("image",)}
@@ -131,16 +132,16 @@ def innermost_loop(code: Code) -> list[str]:
 
 
 def variants(*, few: bool) -> Iterator[Variant]:
-    """Every set of buffers, mode and combination, all taps and a lattice of them; and other windows of all buffers.
+    """Every mode and set of buffers as the presets have them, and with all buffers what else is specialised by.
 
-    With ``few`` forward and loss as the presets have them. Triton keeps what it has compiled: a run that was ended goes
-    on where it was.
+    With ``few`` forward and loss as in the presets. Triton keeps what it has compiled: a run that was ended goes on
+    where it was.
     """
-    usual = product(TARGETS, ("FORWARD", "LOSS"), [EVERYTHING], [19], [1], ["eq10"])
-    every = product(TARGETS, UNUSED, BUFFERS, [19], [1, 4], ["eq10", "eq3"])
-    windows = product(TARGETS, UNUSED, [EVERYTHING], [1, 7, 31], [1], ["eq10"])
-    for variant in usual if few else (*every, *windows):
-        yield compiled(*variant)
+    modes = ("FORWARD", "LOSS") if few else UNUSED
+    usual = product(TARGETS, modes, [EVERYTHING] if few else BUFFERS, [(19, 1, "eq10")])
+    others = product(TARGETS, () if few else UNUSED, [EVERYTHING], _OTHERS)
+    for target, mode, buffers, options in chain(usual, others):
+        yield compiled(target, mode, buffers, *options)
 
 
 def unfit(table: list[Variant]) -> list[Variant]:
