@@ -8,7 +8,7 @@
     ├── FrameError              buffers that do not fit together
     ├── SettingsError           an unknown setting, preset, or a value out of range
     ├── DenoiserError           a denoiser that is unknown, does not fit, or failed
-    ├── DeviceError             a device that is out of memory
+    ├── DeviceError             a device that is out of memory, or cannot record a step
     └── MissingPackageError     an optional package; the message carries the command that installs it
 
 A message is one line: «expected X, but got Y», with the file and the channel named, and the fix.
@@ -88,7 +88,7 @@ class DenoiserError(SelfcorrectError):
 
 
 class DeviceError(SelfcorrectError):
-    """A device cannot hold what it is asked to work on."""
+    """A device cannot hold what it is asked to work on, or not do it in the way that is asked for."""
 
 
 class MissingPackageError(SelfcorrectError):

@@ -119,6 +119,11 @@ class Settings:
         f"{_PAPER}, published code",
         choices=("fp32", "bf16"),
     )
+    cuda_graph: bool = _setting(
+        False,
+        "record a training step on CUDA once and replay it: less work for the host; never tried on a GPU",
+        "not in the paper; scripts/bench/gpu.py measures it where there is a GPU",
+    )
     patch: int = _setting(128, "side of a training patch, pixels", f"{_PAPER}, Sec. 4", least=1, most=65536)
     stride: int = _setting(64, "distance of neighbouring patches, pixels", f"{_PAPER}, Sec. 4", least=1)
     batch: int = _setting(16, "patches in one optimiser step", f"{_PAPER}, Sec. 4", least=1, most=65536)

@@ -2,8 +2,9 @@
 
 Torch's ``meta`` device stands in for it where nothing need be computed: its tensors have no values, so that whatever
 would make the host wait (``float``, ``bool``, ``tolist``, a copy to the CPU) raises, and so does most of what mixes
-tensors of two devices. It is a mock: it shows that the host asks for nothing, not that a device computes the right
-thing. The kernel itself runs in Triton's interpreter (see tests/kernel/test_cross_bilateral.py).
+tensors of two devices. Where values are needed, tensors of the CPU in disguise stand in (helpers/elsewhere.py).
+Both are mocks: they show what the host asks for and what lies where, not that a device computes the right thing. The
+kernel itself runs in Triton's interpreter (see tests/kernel/test_cross_bilateral.py).
 """
 
 import argparse
@@ -16,6 +17,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.elsewhere import ELSEWHERE, Elsewhere, elsewhere
 from helpers.tolerances import INTERPRETED_LOSS, near
 from torch import Tensor
 
@@ -32,6 +34,8 @@ from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.deep_combiner import DeepCombiner, combine_whole, feature_planes
 
 META = torch.device("meta")
+TESTS = Path(__file__).parent
+BENCH = TESTS.parent / "scripts" / "bench"
 
 
 def make_frame(size: tuple[int, int] = (32, 32), *, features: bool = True) -> Frame:
@@ -113,6 +117,35 @@ def test_a_whole_frame_through_the_interpreter(monkeypatch: pytest.MonkeyPatch) 
     assert interpreted.losses == pytest.approx(compiled.losses, rel=INTERPRETED_LOSS)
 
 
+@pytest.mark.parametrize("stages", ["regression,james-stein,core,neural-james-stein", "deep-combiner"])
+def test_a_whole_frame_elsewhere(stages: str) -> None:
+    """On a device that is neither the CPU nor CUDA: kernels by the reference, shift by shift, nothing left behind."""
+    changes = {"patch": 8, "batch": 1, "steps": 1, "window": 3, "layers": 2, "inference": "full"}
+    settings = Settings.preset("balanced", stages=stages, **changes)
+    here = correct(make_frame(), settings)
+    with elsewhere() as waited:
+        frame = make_frame().to(ELSEWHERE)
+        assert waited() == 0
+        result = correct(frame, settings)
+        assert all(isinstance(image, Elsewhere) for image in result.maps.values())
+        blend = result.maps["blend"].cpu()
+    torch.testing.assert_close(result.image, here.image, **near("whole frame elsewhere"))
+    torch.testing.assert_close(blend, here.maps["blend"], **near("whole frame elsewhere"))
+
+
+def test_the_disguise_refuses_what_a_device_would() -> None:
+    """The mock can fail: tensors here and elsewhere do not mix, and who looks at a value waits."""
+    with elsewhere() as waited:
+        there = torch.ones(3).to(ELSEWHERE)
+        with pytest.raises(AssertionError, match="on the CPU"):
+            there + torch.ones(3)
+        with pytest.raises(AssertionError, match="on the CPU"):
+            there.index_select(0, torch.tensor([0]))
+        assert waited() == 0
+        assert (float(there[0]), there.tolist(), there.cpu().sum()) == (1.0, [1.0] * 3, 3.0)
+        assert waited() == 3
+
+
 def test_where_no_value_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """A device that runs out of memory in the middle of a frame."""
 
@@ -167,14 +200,16 @@ def test_frames_move_without_touching_the_one_given() -> None:
     assert frame.color[0].device.type == "cpu"
 
 
+def compiling(*command: str | Path, **more: str) -> Any:
+    """What a command prints as JSON, in a process where Triton compiles and does not interpret."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"} | more
+    ran = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, check=True)
+    return json.loads(ran.stdout)
+
+
 def test_every_target_is_compiled_without_spilling() -> None:
-    """Ahead of time, as scripts/bench/gpu.py prints it for many more variants; in a process without the interpreter."""
-    script = Path(__file__).parent.parent / "scripts" / "bench" / "gpu.py"
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    ran = subprocess.run(
-        [sys.executable, script, "--few", "--json"], env=environment, capture_output=True, text=True, check=True
-    )
-    table = json.loads(ran.stdout)
+    """Ahead of time, as scripts/bench/gpu.py prints it for many more variants."""
+    table = compiling(BENCH / "gpu.py", "--few", "--json")
     assert {v["target"] for v in table} == {80, 90, 120}
     assert {v["mode"] for v in table} == {"FORWARD", "LOSS"}
     for variant in table:
@@ -182,3 +217,11 @@ def test_every_target_is_compiled_without_spilling() -> None:
         assert variant["shared"] <= 48 << 10, variant
         assert variant["registers"] <= 128, variant  # four programs of 128 threads on a multiprocessor
         assert variant["loads"] == 13, variant  # one for each channel: nothing is read twice in a tap
+
+
+def test_what_is_launched_is_what_the_table_compiled() -> None:
+    """The host's side of a launch, types and constants of its own choice, up to a driver that launches nothing."""
+    paths = os.pathsep.join(map(str, (TESTS, BENCH)))
+    launched = compiling("-m", "helpers.launches", PYTHONPATH=paths)
+    assert launched["same"] == [True] * 3
+    assert launched["grids"] == [[9 * 2, 2, 1]] * 3  # tiles of 4 × 32 in 33 × 37 pixels, patches

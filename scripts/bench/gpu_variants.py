@@ -6,18 +6,29 @@
 import re
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, combinations, product
 from pathlib import Path
 
 import triton
-from kernel import ALL, SETS, make_guides
+from kernel import make_guides
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from selfcorrect.kernel.cross_bilateral import Window, gpu, program
 
-BUFFERS = {"y z": SETS["color"], "y z ρ n": SETS["color, albedo, normal"], "y z ρ n v": ALL}
+_OPTIONAL = {"ρ": "albedo", "n": "normal", "v": "visibility"}
+BUFFERS = {
+    " ".join(("y z", *some)): ("color", "denoised", *(_OPTIONAL[symbol] for symbol in some))
+    for some in chain.from_iterable(combinations(_OPTIONAL, count) for count in range(len(_OPTIONAL) + 1))
+}
+"""What a frame may have, by symbols of Eq. 10: each buffer that need not be there, there and absent."""
+
+EVERYTHING = "y z ρ n v"
+_OTHERS = ((19, 1, "eq3"), (19, 4, "eq10"), (1, 1, "eq10"), (7, 1, "eq10"), (31, 1, "eq10"))
+LARGEST_SHARED = 48 << 10  # bytes of a program, on every card and without asking for more
+
 UNUSED = {"FORWARD": ("gradient", "target", "weight"), "BACKWARD": ("target", "weight"), "LOSS": ("image",)}
 """Modes of the kernel, and which pointers they are not given."""
 
@@ -54,18 +65,9 @@ class Variant:
 
 def compiled(target: int, mode: str, buffers: str, window: int, every: int, combination: str) -> Variant:
     """Compile one variant ahead of time."""
-    terms = gpu.terms_of(make_guides(8, BUFFERS[buffers]))
-    constants = gpu.specialisation(terms, Window(window, every, combination), gpu.TILE)
-    constants["MODE"] = getattr(program, mode).value
-    constants |= dict.fromkeys(UNUSED[mode])
-    pointers = {"corners": "*i64"} | dict.fromkeys(
-        ("planes", "raw", "image", "gradient", "target", "weight", "losses"), "*fp32"
-    )
-    names = program.program.arg_names
-    types = {name: "constexpr" if name in constants else pointers.get(name, "i32") for name in names}
-    source = ASTSource(program.program, signature=types, constexprs=constants)
+    window_ = Window(window, every, combination)
     options = {"num_warps": gpu.WARPS, "enable_fp_fusion": True}
-    result = triton.compile(source, target=GPUTarget("cuda", target, 32), options=options)
+    result = triton.compile(source(mode, buffers, window_), target=GPUTarget("cuda", target, 32), options=options)
     usage, code = dumped(result.asm["cubin"])
     loop = innermost_loop(code)
     return Variant(
@@ -82,6 +84,20 @@ def compiled(target: int, mode: str, buffers: str, window: int, every: int, comb
         multiply_adds=loop.count("FFMA"),
         loads=loop.count("LDG"),
     )
+
+
+def source(mode: str, buffers: str, window: Window) -> ASTSource:
+    """The device function with the types that a launch gives it; torch aligns tensors to 16 bytes and more."""
+    constants = gpu.specialisation(gpu.terms_of(make_guides(8, BUFFERS[buffers])), window, gpu.TILE)
+    constants["MODE"] = getattr(program, mode).value
+    constants |= dict.fromkeys(UNUSED[mode])
+    pointers = {"corners": "*i64"} | dict.fromkeys(
+        ("planes", "raw", "image", "gradient", "target", "weight", "losses"), "*fp32"
+    )
+    names = program.program.arg_names
+    types = {name: "constexpr" if name in constants else pointers.get(name, "i32") for name in names}
+    aligned = {(i,): [["tt.divisibility", 16]] for i, name in enumerate(names) if types[name].startswith("*")}
+    return ASTSource(program.program, signature=types, constexprs=constants, attrs=aligned)
 
 
 Code = list[tuple[int, str, str]]
@@ -104,7 +120,7 @@ def dumped(cubin: bytes) -> tuple[dict[str, int], Code]:
 
 
 def innermost_loop(code: Code) -> list[str]:
-    """Names of the instructions of the loop that has no other in it and evaluates an exponential."""
+    """Instructions of the loop that has no other in it and evaluates an exponential; where there is one tap, none."""
     loops = []
     for address, name, operands in code:
         target = re.search(r"0x([0-9a-f]+)", operands)
@@ -112,18 +128,25 @@ def innermost_loop(code: Code) -> list[str]:
             body = [other for at, other, _ in code if int(target[1], 16) <= at <= address]
             if "MUFU" in body:
                 loops.append(body)
-    return min(loops, key=len)
+    return min(loops, key=len, default=[])
 
 
-def variants(*, few: bool) -> list[Variant]:
-    """Every one that the presets meet, with those of the settings; or one of each mode."""
-    if few:
-        return [compiled(t, m, "y z ρ n v", 19, 1, "eq10") for t in TARGETS for m in ("FORWARD", "LOSS")]
-    usual = product(TARGETS, UNUSED, BUFFERS, ((19, 1, "eq10"),))
-    others = product(
-        TARGETS, UNUSED, ("y z ρ n v",), ((19, 1, "eq3"), (19, 4, "eq10"), (31, 1, "eq10"), (7, 1, "eq10"))
-    )
-    return [compiled(t, m, b, *options) for t, m, b, options in (*usual, *others)]
+def variants(*, few: bool) -> Iterator[Variant]:
+    """Every mode and set of buffers as the presets have them, and with all buffers what else is specialised by.
+
+    With ``few`` forward and loss as in the presets. Triton keeps what it has compiled: a run that was ended goes on
+    where it was.
+    """
+    modes = ("FORWARD", "LOSS") if few else UNUSED
+    usual = product(TARGETS, modes, [EVERYTHING] if few else BUFFERS, [(19, 1, "eq10")])
+    others = product(TARGETS, () if few else UNUSED, [EVERYTHING], _OTHERS)
+    for target, mode, buffers, options in chain(usual, others):
+        yield compiled(target, mode, buffers, *options)
+
+
+def unfit(table: list[Variant]) -> list[Variant]:
+    """Those that spill, or take more shared memory than every card has."""
+    return [variant for variant in table if variant.spilled or variant.shared > LARGEST_SHARED]
 
 
 def programs_together(variant: Variant) -> int:

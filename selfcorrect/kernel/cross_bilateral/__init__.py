@@ -17,7 +17,15 @@ from selfcorrect.kernel.cross_bilateral import cpu, reference
 from selfcorrect.kernel.cross_bilateral.window import LARGEST_WINDOW, Window
 from selfcorrect.kernel.guides import Guides
 
-__all__ = ["LARGEST_WINDOW", "Form", "Window", "cross_bilateral", "cross_bilateral_loss", "heads_count"]
+__all__ = [
+    "LARGEST_WINDOW",
+    "Form",
+    "Window",
+    "check_reach",
+    "cross_bilateral",
+    "cross_bilateral_loss",
+    "heads_count",
+]
 
 
 class Form(Protocol):
@@ -79,6 +87,7 @@ def cross_bilateral(
         guides: padded buffers of one half, linear radiance.
         raw: network outputs before tanh and softplus, (N, heads, h, w), any strides.
         corners: image row and column of each patch's first pixel, (N, 2), int64, on the CPU; may lie outside the image.
+            The form for CUDA takes them on its device, too: then who calls has asked :func:`check_reach` before.
         window: taps and combination.
         threads: of the compiled form.
         backend: as for :func:`selfcorrect.kernel.backend.choose`.
@@ -120,16 +129,24 @@ def _validate(guides: Guides, raw: Tensor, corners: Tensor, window: Window) -> N
     heads = heads_count(guides, window.combination)
     if raw.ndim != 4 or raw.shape[1] != heads:
         raise FrameError(f"expected raw heads of shape (N, {heads}, h, w), but got {tuple(raw.shape)}")
-    if corners.shape != (raw.shape[0], 2) or corners.dtype != torch.int64 or corners.device.type != "cpu":
+    there = corners.device.type
+    known = there in ("cpu", guides.planes.device.type)
+    if corners.shape != (raw.shape[0], 2) or corners.dtype != torch.int64 or not known:
         raise FrameError(
             f"expected int64 corners of shape ({raw.shape[0]}, 2) on the CPU, "
-            f"but got {corners.dtype} of {tuple(corners.shape)} on {corners.device.type}"
+            f"but got {corners.dtype} of {tuple(corners.shape)} on {there}"
         )
     if raw.dtype != guides.planes.dtype:
         raise FrameError(f"expected raw heads in {guides.planes.dtype}, but got {raw.dtype}")
+    if there == "cpu":  # elsewhere to look at them would be to wait
+        check_reach(guides, corners, (raw.shape[2], raw.shape[3]), window)
+
+
+def check_reach(guides: Guides, corners: Tensor, size: tuple[int, int], window: Window) -> None:
+    """Raise a FrameError where a window of patches of this size reaches beyond the guides; ``corners`` on the CPU."""
     reach = guides.margin - window.radius
     bottom = (guides.stacked - 1) * guides.pitch + guides.height
-    last = corners + torch.tensor([raw.shape[2] - bottom, raw.shape[3] - guides.width])
+    last = corners + torch.tensor([size[0] - bottom, size[1] - guides.width])
     if corners.numel() and (corners.min() < -reach or last.max() > reach):
         raise FrameError(
             f"expected patches at most {reach} pixels outside the image, but got one beyond (margin {guides.margin})"

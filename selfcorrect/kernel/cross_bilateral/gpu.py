@@ -74,26 +74,27 @@ def _launch(
     rows, columns = options.tile
     tiles = -(-height // rows) * -(-width // columns)
     losses = raw.new_empty(patches * tiles if mode is LOSS else 0)
-    program[(tiles, patches)](
-        guides.planes,
-        raw,
-        corners,
-        image,
-        gradient,
-        target,
-        weight,
-        losses,
-        *guides.planes.stride()[:2],
-        *raw.stride(),
-        *((0, 0, 0, 0) if gradient is None else gradient.stride()),
-        0 if target is None else target.stride(0),
-        height,
-        width,
-        MODE=mode,
-        **specialisation(terms_of(guides), options.window, options.tile),
-        num_warps=WARPS,
-        enable_fp_fusion=True,
-    )
+    with torch.cuda.device_of(raw):  # Triton asks for the current device, not for that of the tensors
+        program[(tiles, patches)](
+            guides.planes,
+            raw,
+            corners,
+            image,
+            gradient,
+            target,
+            weight,
+            losses,
+            *guides.planes.stride()[:2],
+            *raw.stride(),
+            *((0, 0, 0, 0) if gradient is None else gradient.stride()),
+            0 if target is None else target.stride(0),
+            height,
+            width,
+            MODE=mode,
+            **specialisation(terms_of(guides), options.window, options.tile),
+            num_warps=WARPS,
+            enable_fp_fusion=True,
+        )
     return losses
 
 

@@ -3,17 +3,19 @@
 import copy
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from selfcorrect.kernel.backend import choose
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.loss import dual_buffer_loss, learning_rate, relative_weight
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.patches import batches, most_steps, steps_count
+from selfcorrect.stages.core.replay import CudaGraph, Replayed
 
 __all__ = ["Adam", "Limits", "Progress", "starting_losses", "train"]
 
@@ -47,10 +49,10 @@ class Adam:
         self._each = torch.tensor([0.9, 0.999], dtype=torch.float64).to(self._first.device)
 
     @torch.no_grad()
-    def step(self, rate: float, loss: Tensor) -> None:
+    def step(self, rate: float | Tensor, loss: Tensor) -> None:
         """One step down the gradients, which are taken away; none where they or the loss are not finite.
 
-        Nothing here makes the host wait for the device.
+        Nothing here makes the host wait for the device, and a CUDA graph can hold it where ``rate`` is a tensor.
         """
         gradient = torch.cat(
             [torch.zeros_like(p).flatten() if p.grad is None else p.grad.flatten() for p in self._parameters]
@@ -169,16 +171,26 @@ def _round(
     rate = learning_rate(guides, settings)
     steps = steps_count((guides[0].height, guides[0].width), settings)
     losses = _Losses(progress, guides[0].planes.device)
+
+    def step(patches: Sequence[Tensor], corners: Tensor, rate: float | Tensor) -> Tensor:
+        loss = dual_buffer_loss(network(patches), corners, guides, weights, settings)
+        loss.backward()
+        optimiser.step(rate, loss.detach())
+        return loss.detach()
+
+    recording = settings.cuda_graph and choose(None, [guides[0].planes], gpu=True) == "gpu"
+    replayed = Replayed(step, guides, settings, CudaGraph(guides[0].planes.device)) if recording else None
     began = time.perf_counter()
     for corners in batches(guides[0], settings, generator):
         done = max(losses.count / steps, (time.perf_counter() - began) / max(end - began, 1e-9)) if steps else 1.0
         if done >= 1 or stop():
             break
-        batch = [patch for half in guides for patch in half.views(corners, size)]
-        loss = dual_buffer_loss(network(batch), corners, guides, weights, settings)
-        loss.backward()
-        optimiser.step(rate * _schedule(losses.count, steps, done, settings), loss.detach())
-        losses.add(loss.detach(), steps)
+        now = rate * _schedule(losses.count, steps, done, settings)
+        if replayed:
+            loss = replayed(corners, now)
+        else:
+            loss = step([patch for half in guides for patch in half.views(corners, size)], corners, now)
+        losses.add(loss, steps)
     return losses.fetched(steps)
 
 
