@@ -9,6 +9,7 @@ Needs the extra ``render``.
 """
 
 import argparse
+import importlib
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -21,7 +22,7 @@ from selfcorrect.stages.uncorrelated import KERNELS, combine
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "render"))
 
-import common_random_numbers as crn
+import variants
 from screened_poisson import screened_poisson
 
 Image = np.ndarray[Any, Any]
@@ -34,14 +35,18 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=8, help="of each of the eight renders")
     parser.add_argument("--reference", type=int, default=64, help="renders of 256 samples")
     options = parser.parse_args()
+    if variants.failure() is not None:
+        parser.error(variants.refusal("common random numbers"))
+    crn = importlib.import_module("common_random_numbers")  # fails where there is no LLVM library
     scenes = {common: crn.cornell_box(common=common, size=options.size) for common in (False, True)}
     references = np.stack([crn.render(scenes[False], 256, 100_000 + i) for i in range(options.reference)])
     reference = references.mean(0)
     weight = 1 / (reference.mean(-1, keepdims=True) ** 2 + 0.01)
     noise = float((weight * references.var(0, ddof=1)).mean()) / options.reference
     results: dict[str, list[Image]] = defaultdict(list)
-    for round_ in range(options.rounds):
-        for name, image in combined(scenes, options.spp, 8 * round_).items():
+    for first in range(0, 8 * options.rounds, 8):
+        y, z = ([crn.render(scenes[c], options.spp, first + 4 * c + i) for i in range(4)] for c in (False, True))
+        for name, image in combined(y, z, options.spp).items():
             results[name].append(image - reference)
     print(f"{options.rounds} rounds, {options.size}x{options.size}, 4 x {options.spp} spp of each kind; ", end="")
     print(f"relative variance of the reference {noise:.2g}\n| | relMSE | squared bias |\n|---|---|---|")
@@ -51,10 +56,8 @@ def main() -> None:
         print(f"| {name} | {mse:.6f} | {bias:.7f} |")
 
 
-def combined(scenes: dict[bool, Any], spp: int, seed: int) -> dict[str, Image]:
+def combined(y: list[Image], z: list[Image], spp: int) -> dict[str, Image]:
     """What each kernel makes of four independent and four correlated renders, and of screened Poisson images."""
-    y = [crn.render(scenes[False], spp, seed + i) for i in range(4)]
-    z = [crn.render(scenes[True], spp, seed + 4 + i) for i in range(4)]
     poisson = [screened_poisson(own, common) for own, common in zip(y, z, strict=True)]
     images = {"y": np.mean(y, 0), "z": np.mean(z, 0), "screened Poisson": np.mean(poisson, 0)}
     independent, correlated, made = (tuple(torch.from_numpy(i) for i in four) for four in (y, z, poisson))
