@@ -170,6 +170,11 @@ class Settings:
     crossed_weights: bool = _setting(
         False, "weigh a half's loss by its own denoised image, not by its witness's", _OURS
     )
+    witness_limit: float = _setting(
+        0.0,
+        "how many times the spread around it a witness's pixel may lie from its denoised image in the loss; 0: any",
+        "not in the paper; scripts/bench/witness.py measures it",
+    )
     candidates: str = _setting(
         "none",
         "further denoised images, of the denoiser's other modes, that the guard may blend in: none; auto, those that a "
@@ -263,6 +268,7 @@ class Settings:
             guard=True,
             fireflies="remove",
             crossed_weights=True,
+            witness_limit=8.0,
             precision="bf16",
             candidates="auto",
             frame_radius=2,

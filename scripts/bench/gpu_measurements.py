@@ -19,7 +19,7 @@ from selfcorrect import Frame, Settings, correct
 from selfcorrect.kernel.convolution import convolutions
 from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral_loss, heads_count
 from selfcorrect.kernel.guides import Guides
-from selfcorrect.stages.core.loss import dual_buffer_loss, relative_weight
+from selfcorrect.stages.core.loss import dual_buffer_loss, witnesses
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.patches import batches
 from selfcorrect.stages.core.replay import CudaGraph, Replayed
@@ -49,7 +49,7 @@ def parts(settings: Settings, a: Guides, b: Guides, *, backend: str | None = Non
     network = Network.for_guides(a, settings, generator)
     weights, device = list(network.parameters()), a.planes.device
     optimiser = Adam(weights, settings.adam_epsilon, settings.gradient_limit or float("inf"))
-    relative = (relative_weight(b.denoised, settings.loss_epsilon), relative_weight(a.denoised, settings.loss_epsilon))
+    judges = witnesses((a, b), settings)
     corners = next(iter(batches(a, settings, generator))).clamp(0, a.height - settings.patch)
 
     def heads(patches: Any) -> Tensor:
@@ -66,7 +66,7 @@ def parts(settings: Settings, a: Guides, b: Guides, *, backend: str | None = Non
         return [patch for half in (a, b) for patch in half.views(corners, (settings.patch, settings.patch))]
 
     def taken(patches: Any, corners: Tensor, rate: Any) -> Tensor:
-        loss = dual_buffer_loss(heads(patches), corners, (a, b), relative, settings)
+        loss = dual_buffer_loss(heads(patches), corners, (a, b), judges, settings)
         loss.backward()
         optimiser.step(rate, loss.detach())
         return loss.detach()
@@ -76,7 +76,7 @@ def parts(settings: Settings, a: Guides, b: Guides, *, backend: str | None = Non
 
     def kernel() -> None:
         raw.grad = None
-        dual_buffer_loss(raw, corners, (a, b), relative, settings).backward()
+        dual_buffer_loss(raw, corners, (a, b), judges, settings).backward()
 
     def of_network() -> None:
         heads(views()).backward(upstream)

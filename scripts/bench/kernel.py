@@ -19,7 +19,7 @@ from selfcorrect.buffers import TERMS
 from selfcorrect.kernel.backend import instruction_sets
 from selfcorrect.kernel.cross_bilateral import Window, cpu, heads_count, reference
 from selfcorrect.kernel.guides import Guides
-from selfcorrect.stages.core.loss import dual_buffer_loss
+from selfcorrect.stages.core.loss import dual_buffer_loss, witnesses
 from selfcorrect.stages.core.network import Network
 
 WINDOW = Window(19)
@@ -94,14 +94,14 @@ def split_run(size: int) -> None:
     total = time.perf_counter() - start
 
     guides = tuple(Guides.of_half(half._asdict(), margin=73) for half in frame.halves)
-    weights = tuple(torch.ones_like(half.planes[0]) for half in guides)
+    judges = witnesses(guides, settings)
     corners = torch.randint(0, size - 128, (settings.batch, 2), generator=generator)
     batch = torch.cat([half.patches(corners, (128, 128)) for half in guides])
     network = Network.for_guides(guides[0], settings, generator)
     raw = network(batch).detach().requires_grad_()
 
     def kernel() -> None:
-        dual_buffer_loss(raw, corners, guides, weights, settings).backward()
+        dual_buffer_loss(raw, corners, guides, judges, settings).backward()
 
     upstream = torch.randn_like(raw)
 

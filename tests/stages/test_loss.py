@@ -11,7 +11,7 @@ from torch import Tensor
 from selfcorrect import Settings
 from selfcorrect.image.exposure import LARGEST
 from selfcorrect.kernel.guides import Guides
-from selfcorrect.stages.core.loss import dual_buffer_loss, relative_weight
+from selfcorrect.stages.core.loss import dual_buffer_loss, witnesses
 from selfcorrect.stages.core.network import Network
 
 SIZE, PATCH = (24, 28), (16, 16)
@@ -46,9 +46,9 @@ def gradients(
     """Eq. 8 and its gradient in all parameters: compiled in float32, plain torch in float64."""
     own = copy.deepcopy(network).to(dtype)
     a, b = (replace(half, planes=half.planes.to(dtype)) for half in guides)
-    weights = (relative_weight(a.denoised, settings.loss_epsilon), relative_weight(b.denoised, settings.loss_epsilon))
+    judges = witnesses((a, b), settings)
     patches = [patch for half in (a, b) for patch in half.views(CORNERS, PATCH)]
-    loss = dual_buffer_loss(own(patches), CORNERS, (a, b), weights, settings)
+    loss = dual_buffer_loss(own(patches), CORNERS, (a, b), judges, settings)
     loss.backward()
     return float(loss.detach()), torch.cat([p.grad.flatten() for p in own.parameters() if p.grad is not None])
 
@@ -87,3 +87,32 @@ def test_gradients_of_extremes_are_those_of_float64(preset: str, case: str, valu
     largest = float(expected.abs().max())
     assert largest > 0
     assert float((got - expected).abs().max()) <= bound * largest
+
+
+LIMITED = Settings.preset("balanced")
+ANY = Settings.preset("balanced", witness_limit=0.0)
+
+
+def test_without_a_limit_the_witness_is_what_was_measured() -> None:
+    a, b = halves("firefly", 1e4, 0)
+    of_a, of_b = witnesses((a, b), ANY)
+    assert torch.equal(of_a.radiance, b.radiance)
+    assert torch.equal(of_b.radiance, a.radiance)
+
+
+def test_a_firefly_of_the_witness_does_not_outweigh_the_frame() -> None:
+    a, b = halves("firefly", 1e4, 0)  # in half a, which half b's correction is judged by
+    there = (slice(None), 12 + a.margin, 13 + a.margin)
+    bounded = witnesses((a, b), LIMITED)[1].radiance
+    spread = float((b.radiance - b.denoised).square().mean().sqrt())
+    assert float(a.radiance[there].max()) == 1e4
+    assert float((bounded - a.denoised)[there].abs().max()) < 3 * LIMITED.witness_limit * spread
+    ordinary = a.radiance < 10  # all but the firefly and its mirror images
+    torch.testing.assert_close(bounded[ordinary], a.radiance[ordinary])
+
+
+def test_no_pixel_moves_its_own_bound() -> None:
+    """What the witness of half b measures at a pixel, half a's radiance there, may not say how far it may lie."""
+    a, b = halves("firefly", 1e4, 0)
+    brighter, _ = halves("firefly", 1e6, 0)
+    assert torch.equal(witnesses((a, b), LIMITED)[1].radiance, witnesses((brighter, b), LIMITED)[1].radiance)

@@ -11,7 +11,7 @@ from selfcorrect import Frame, Settings, correct
 from selfcorrect.buffers import TERMS
 from selfcorrect.kernel.cross_bilateral import Window, heads_count, reference
 from selfcorrect.kernel.guides import Guides
-from selfcorrect.stages.core.loss import dual_buffer_loss, learning_rate, relative_weight
+from selfcorrect.stages.core.loss import dual_buffer_loss, learning_rate, witnesses
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.patches import grid
 
@@ -126,8 +126,7 @@ def test_loss_is_eq8() -> None:
     guides = (full_guides(seed=1), full_guides(seed=2))
     corners = torch.tensor([[0, 0], [2, 1]])
     raw = torch.randn(4, 15, 8, 8)
-    weights = tuple(relative_weight(half.denoised, PAPER.loss_epsilon) for half in guides)
-    loss = float(dual_buffer_loss(raw, corners, guides, weights, PAPER))
+    loss = float(dual_buffer_loss(raw, corners, guides, witnesses(guides, PAPER), PAPER))
     terms = []
     for g_from, other, heads in ((guides[0], guides[1], raw[:2]), (guides[1], guides[0], raw[2:])):
         g = reference.cross_bilateral(g_from, heads, corners, Window(19))

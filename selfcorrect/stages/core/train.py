@@ -12,7 +12,7 @@ from torch import Tensor
 from selfcorrect.kernel.backend import choose
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.settings import Settings
-from selfcorrect.stages.core.loss import dual_buffer_loss, learning_rate, relative_weight
+from selfcorrect.stages.core.loss import dual_buffer_loss, learning_rate, witnesses
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.patches import batches, most_steps, steps_count
 from selfcorrect.stages.core.replay import CudaGraph, Replayed
@@ -165,7 +165,7 @@ def _round(
     end: float,
 ) -> list[float]:
     """The settings' steps, or as many as there is time for; the schedule's end is reached in either case."""
-    weights = _weights(guides, settings)
+    judges = witnesses(guides, settings)
     size = (settings.patch, settings.patch)
     optimiser = Adam(network.parameters(), settings.adam_epsilon, settings.gradient_limit or math.inf)
     rate = learning_rate(guides, settings)
@@ -173,7 +173,7 @@ def _round(
     losses = _Losses(progress, guides[0].planes.device)
 
     def step(patches: Sequence[Tensor], corners: Tensor, rate: float | Tensor) -> Tensor:
-        loss = dual_buffer_loss(network(patches), corners, guides, weights, settings)
+        loss = dual_buffer_loss(network(patches), corners, guides, judges, settings)
         loss.backward()
         optimiser.step(rate, loss.detach())
         return loss.detach()
@@ -207,18 +207,12 @@ def starting_losses(network: Network, guides: tuple[Guides, Guides], settings: S
     if guides[0].stacked > 1:
         first = guides[0].pitch * torch.linspace(0, guides[0].stacked - 1, _SAMPLE**2).long().unique()
         corners = torch.stack([first, torch.zeros_like(first)], 1)
-    weights = _weights(guides, settings)
+    judges = witnesses(guides, settings)
     losses = []
     for corner in corners.split(1):  # one at a time: less memory than a training step
         raw = network([patch for half in guides for patch in half.views(corner, size)])
-        losses.append(dual_buffer_loss(raw, corner, guides, weights, settings).double())
+        losses.append(dual_buffer_loss(raw, corner, guides, judges, settings).double())
     return torch.stack(losses)
-
-
-def _weights(guides: tuple[Guides, Guides], settings: Settings) -> tuple[Tensor, Tensor]:
-    a, b = (relative_weight(half.denoised, settings.loss_epsilon) for half in guides)
-    # a weight that knows the witness rewards darkening
-    return (b, a) if settings.crossed_weights else (a, b)
 
 
 def _schedule(step: int, steps: int, done: float, settings: Settings) -> float:
