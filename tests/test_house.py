@@ -16,7 +16,7 @@ ORDER = (
     {"kernel"},
     {"frame", "exr"},
     {"stages", "pooling"},
-    {"guard", "fireflies", "independence", "metrics"},
+    {"guard", "fireflies", "independence", "lone_pixels", "metrics"},
     {"correct", "candidates", "history", "aovs"},
     {"aov_channels"},
     {"files", "facts"},
