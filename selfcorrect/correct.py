@@ -16,7 +16,7 @@ from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.independence import dependence
-from selfcorrect.lone_pixels import lone_pixels, set_aside
+from selfcorrect.lone_pixels import lone_pixels, set_aside, unjudged
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.infer import SIDE
 from selfcorrect.stages.core.network import Network
@@ -161,7 +161,7 @@ def correct(
         begun = time.perf_counter()
         image, guarded = judge.blend(state, image)
         seconds["guard"] = time.perf_counter() - begun
-    estimate = guarded.estimate if guarded else None
+    estimate = guarded.estimate.with_unjudged(unjudged(first.full, frame.halves, lone)) if guarded else None
     removed = None
     if settings.fireflies == "remove":
         begun = time.perf_counter()

@@ -5,7 +5,8 @@ or there is a star, a glint, a lamp of a pixel's size. The halves cannot tell wh
 errors are not alike: a star that is lost costs its own pixel, a firefly that is put back costs its whole energy. So
 what the denoiser of the full buffer says stands there. Such a pixel is set aside before anything is learned or judged:
 each noisy half takes the value that its own denoised image has there, so that nothing is learned from it, no change of
-it is confirmed, and no gain is claimed for it. The halves stay independent of each other.
+it is confirmed, and no gain is claimed for it. What the denoised image may have left of a firefly there counts in the
+estimate as an error that stays. The halves remain independent of each other.
 
 A lamp is taken for one, and believed, where a pixel beside it shares its light, or where its albedo is brighter than
 all around it: it is then a thing that the renderer's first hit has seen. Emission is no buffer of a frame.
@@ -24,7 +25,7 @@ from torch import Tensor
 from selfcorrect.frame import Half
 from selfcorrect.image.bands import bands
 
-__all__ = ["lone_pixels", "set_aside"]
+__all__ = ["lone_pixels", "set_aside", "unjudged"]
 
 Halves = tuple[Half, Half]
 
@@ -78,6 +79,22 @@ def set_aside(halves: Halves, pixels: Tensor) -> Halves:
         return half._replace(color=color)
 
     return one(halves[0]), one(halves[1])
+
+
+def unjudged(image: Tensor, halves: Halves, pixels: Tensor) -> float:
+    """The relMSE that an image has at these pixels if they are fireflies, that is, if the truth is what lies around.
+
+    Args:
+        image: (H, W, 3) linear radiance.
+        halves: noisy; what both show of the eight neighbours is what lies around.
+        pixels: (N, 2), rows and columns.
+    """
+    if not len(pixels):
+        return 0.0
+    around = torch.stack([_beside(half.color, pixels) for half in halves]).amin(0).mean(0)
+    shown = image[pixels[:, 0], pixels[:, 1]].double().mean(-1)
+    errors = (shown - around) ** 2 / (around**2 + 0.01)
+    return float(errors.sum()) / (image.shape[0] * image.shape[1])
 
 
 def _sum(image: Tensor) -> Tensor:

@@ -5,7 +5,8 @@
 
 Mutant number N of a seed is always the same: `--only N` makes it again and keeps its files. A worker process calls
 the command in process, under a limit of memory; a mutant that works for longer than its limit, or ends the worker, is
-counted and the worker is started anew. Exit code 1 where anything was found.
+counted and the worker is started anew. Ctrl-C ends it with the table of what was tried so far. Exit code 1 where
+anything was found.
 """
 
 import argparse
@@ -330,13 +331,13 @@ def spent(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def mutants(seed: int, seconds: float, most: int) -> Iterator[tuple[int, Found]]:
-    """Number and fate of mutants until the time is up, counted from the first one's."""
-    end, number = float("inf"), 0
-    while number < most and time.monotonic() < end:
+def mutants(seed: int, seconds: float, most: int, first: int = 0) -> Iterator[tuple[int, Found]]:
+    """Number and fate of so many mutants from a first one on, or until the time is up, counted from its fate."""
+    end, number = float("inf"), first
+    while number < first + most and time.monotonic() < end:
         with worker(seed, number) as process:
             assert process.stdout is not None
-            while number < most and time.monotonic() < end:
+            while number < first + most and time.monotonic() < end:
                 ready = answered(process)
                 line = process.stdout.readline() if ready else b""
                 command, damage = ("", "") if line else _kind(seed, number)
@@ -374,6 +375,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--mutants", type=int, default=10**9, help="most of them")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="go on from this one")
     parser.add_argument("--only", type=int, metavar="N", help="this one, in this process; its files stay")
     parser.add_argument("--work", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -385,12 +387,13 @@ def main() -> int:
         print(*one(options.seed, options.only, folder), sep="\n")
         return 0
     every = []
-    for number, found in mutants(options.seed, options.seconds, options.mutants):
-        every.append(found)
-        if found.outcome not in GOOD:
-            print(f"{number}: {found}", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        for number, found in mutants(options.seed, options.seconds, options.mutants, options.first):
+            every.append(found)
+            if found.outcome not in GOOD:
+                print(f"{number}: {found}", flush=True)
     bad = sum(found.outcome not in GOOD for found in every)
-    print(table(every), f"{len(every)} mutants of seed {options.seed}, {bad} bad", sep="\n")
+    print(table(every), f"{len(every)} mutants of seed {options.seed} from {options.first} on, {bad} bad", sep="\n")
     return int(bad > 0 or not every)
 
 
