@@ -1,5 +1,9 @@
 """selfcorrect: gives denoised Monte Carlo renders their detail back, without a reference image."""
 
+from selfcorrect import start  # isort: split
+
+start.begin()
+
 from selfcorrect.aovs import AovSum, correct_aovs, denoiser_of
 from selfcorrect.correct import Result, correct
 from selfcorrect.errors import SelfcorrectError

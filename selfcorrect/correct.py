@@ -16,6 +16,7 @@ from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.independence import dependence
+from selfcorrect.lone_pixels import lone_pixels, set_aside, unjudged
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.infer import SIDE
 from selfcorrect.stages.core.network import Network
@@ -45,6 +46,8 @@ class Result:
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
         removed: fireflies that were taken out of the corrected colour; None where the settings keep them.
+        lone: how many pixels are as the denoiser has them since nothing around them speaks for what both halves show
+            (:mod:`selfcorrect.lone_pixels`); 0 without the guard.
         input_scale: what radiance was multiplied by.
         start: whether training went on from ``warm_start``, and why.
     """
@@ -57,6 +60,7 @@ class Result:
     removed: Removed | None
     input_scale: float
     start: Start
+    lone: int = 0
 
     @property
     def image(self) -> Any:
@@ -135,6 +139,8 @@ def correct(
     first = StageImages.of(frame.halves, given, settings.input_scale or scale_to_one(given.halves))
     if settings.guard and dependence(*frame.color).tells_nothing:
         return _kept(frame, first)
+    lone = lone_pixels(frame.halves, first.scale) if settings.guard else torch.empty(0, 2)
+    first = first._replace(halves=set_aside(first.halves, lone))
     judge = _Judge(first, more) if settings.guard else None
     state, learned, seconds = first, None, dict[str, float]()
     for stage in opened:
@@ -155,7 +161,7 @@ def correct(
         begun = time.perf_counter()
         image, guarded = judge.blend(state, image)
         seconds["guard"] = time.perf_counter() - begun
-    estimate = guarded.estimate if guarded else None
+    estimate = guarded.estimate.with_unjudged(unjudged(first.full, frame.halves, lone)) if guarded else None
     removed = None
     if settings.fireflies == "remove":
         begun = time.perf_counter()
@@ -173,6 +179,7 @@ def correct(
         removed=removed,
         input_scale=first.scale,
         start=learned.start if learned else Start(warm=False),
+        lone=len(lone),
     )
 
 

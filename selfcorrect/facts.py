@@ -122,6 +122,7 @@ class Corrected:
         place: which tones gained most, in words; empty where nothing did.
         more: what else belongs into the attributes, by name: plain values.
         version: of selfcorrect.
+        lone: how many pixels are left to the denoiser, of which nothing around them says what they are.
     """
 
     before: Denoised
@@ -138,6 +139,7 @@ class Corrected:
     place: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
     version: str = field(default_factory=lambda: version("selfcorrect"))
+    lone: int = 0
 
     @classmethod
     def of(
@@ -158,6 +160,7 @@ class Corrected:
             threads=torch.get_num_threads(),
             place=_place(result),
             more=dict(more or {}),
+            lone=result.lone,
         )
 
     def start_line(self) -> str:
@@ -183,6 +186,7 @@ class Corrected:
             "version": self.version,
             "estimate": None if self.estimate is None else asdict(self.estimate),
             "fireflies": None if self.removed is None else self.removed._asdict(),
+            "lone_pixels": self.lone,
             "start": self.start._asdict(),
             **self.more,
         }
@@ -238,6 +242,11 @@ class Written:
         lines = []
         if removed is not None and removed.pixels:
             lines.append(str(removed))
+        if self.corrected.lone:
+            lines.append(
+                f"left as the denoiser has them: {self.corrected.lone} pixels that both halves show over a hundred "
+                "times as bright as all around, like stars or fireflies"
+            )
         if self.clipped:
             lines.append(f"{self.output}: {self.clipped} values beyond the range of half floats were clipped")
         spent = ", ".join(f"{name} {value:.1f} s" for name, value in self.corrected.seconds.items())

@@ -78,6 +78,7 @@ class Origin:
         other_stamp: likewise.
         alike: both halves call the colour the same, so that their other channels can be told apart by name.
         plan: the AOVs to correct.
+        lost: a line for each attribute of half a that cannot be written back.
     """
 
     path: str
@@ -87,6 +88,7 @@ class Origin:
     other_stamp: tuple[int, int, int]
     alike: bool
     plan: Plan = field(default_factory=Plan)
+    lost: tuple[str, ...] = ()
 
     def reopened(self) -> tuple[exr.ExrFile, exr.ExrFile | None]:
         """Half a; and half b, where the halves' other channels can be told apart by name.
@@ -161,7 +163,7 @@ def load(sources: Sources) -> Loaded:
     except FrameError as error:
         raise FrameError(f"{sources.a} (half a), {sources.b} (half b): {error}") from None
     alike = half_a.taken["color"] == half_b.taken["color"]
-    origin = Origin(sources.a, taken, stamps[0], sources.b, stamps[1], alike)
+    origin = Origin(sources.a, taken, stamps[0], sources.b, stamps[1], alike, lost=half_a.lost)
     return Loaded(frame, replace(origin, plan=_plan(origin, sources.aovs, half_a.taken)))
 
 
@@ -182,16 +184,16 @@ class _Half(NamedTuple):
     buffers: dict[str, Tensor]
     taken: dict[str, list[str]]
     window: tuple[int, ...]  # of the colour's data
+    lost: tuple[str, ...]  # attributes that cannot be written back
 
 
 def _half(path: str, mapping: Mapping[str, str] | None = None, *, passes: bool = False) -> _Half:
     """A half; ``passes``: its other channels and its attributes are to be written again."""
     half = exr.load_half(path, mapping=mapping)
-    if passes:
-        exr.check_source(half.file)
+    lost = exr.check_source(half.file) if passes else []
     used = {role: torch.from_numpy(buffer) for role, buffer in half.buffers.items() if role != "alpha"}
     window = half.file.parts[half.file.place(half.taken["color"][0])[0]].data_window
-    return _Half(used, half.taken, tuple(window))
+    return _Half(used, half.taken, tuple(window), tuple(lost))
 
 
 def _stamp(path: str) -> tuple[int, int, int]:
@@ -257,10 +259,12 @@ class Images:
     Attributes:
         images: (H, W, 3) float32 tensors of linear radiance, finite; a reconstructed one may be negative.
         source: the first one as it was read.
+        lost: a line for each of its attributes that cannot be written back.
     """
 
     images: tuple[Tensor, ...]
     source: exr.HalfFile
+    lost: tuple[str, ...]
 
 
 def load_extra(paths: Sequence[str], size: tuple[int, int]) -> tuple[Tensor, ...]:
@@ -284,10 +288,11 @@ def load_images(paths: Sequence[str]) -> Images:
     _check_different(paths)
     check_alike(paths)
     first = exr.load_half(paths[0])
-    exr.check_source(first.file)
+    lost = exr.check_source(first.file)
     size = first.buffers["color"].shape[:2]
     colors = [first.buffers["color"], *(_color_of(path, size) for path in paths[1:])]
-    return Images(tuple(repaired(color, path) for color, path in zip(colors, paths, strict=True)), first)
+    images = tuple(repaired(color, path) for color, path in zip(colors, paths, strict=True))
+    return Images(images, first, tuple(lost))
 
 
 def save_combined(path: str, images: Images, image: Tensor, *, details: Mapping[str, Any]) -> int:

@@ -81,6 +81,19 @@ class Estimate:
             improved=True,
         )
 
+    def with_unjudged(self, error: float) -> Self:
+        """The estimate where so much relMSE may be in the denoised image and stays in the output, judged by nothing."""
+        if error <= 0:
+            return self
+        denoised = self.denoised + error
+        return replace(
+            self,
+            denoised=denoised,
+            corrected=self.corrected + error,
+            change=(self.corrected - self.denoised) / denoised,
+            standard_error=self.standard_error * self.denoised / denoised,
+        )
+
     def __str__(self) -> str:
         if not self.independent:
             return "relMSE unknown: the halves share their noise, the denoised image is kept; use another seed for one"

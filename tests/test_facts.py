@@ -29,6 +29,7 @@ CORRECTED = facts.Corrected(
     settings=Settings(seed=7),
     estimate=ESTIMATE,
     removed=REMOVED,
+    lone=2,
     start=Start(warm=True, cold_loss=0.5, warm_loss=0.25),
     seconds={"train": 1.0, "infer": 0.25},
     input_scale=2.0,
@@ -45,6 +46,7 @@ RUN = {
     "version": version("selfcorrect"),
     "estimate": asdict(ESTIMATE),
     "fireflies": {"pixels": 0.002, "light": 0.0015, "error": 0.25, "standard_error": 0.125},
+    "lone_pixels": 2,
     "start": {"warm": True, "cold_loss": 0.5, "warm_loss": 0.25},
     "frame": 3,
 }
@@ -89,13 +91,15 @@ def test_log() -> None:
     assert WRITTEN.lines() == [
         "fireflies of one half were removed from 0.20% of the pixels, with 0.15% of the light; --fireflies keep leaves "
         "them",
+        "left as the denoiser has them: 2 pixels that both halves show over a hundred times as bright as all around, "
+        "like stars or fireflies",
         "out.exr: 4 values beyond the range of half floats were clipped",
         "other channels: 3 the mean of both halves, 2 as in half a",
         "out.exr: written after 2.0 s (train 1.0 s, infer 0.2 s)",
         "out.exr: error about 25 % lower, mostly in the highlights (relMSE ≈ 0.02 → 0.015, -25 ± 3 %)",
     ]
-    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None, removed=None))
-    assert unguarded.lines() == WRITTEN.lines()[2:4]
+    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None, removed=None, lone=0))
+    assert unguarded.lines() == WRITTEN.lines()[3:5]
     assert unguarded.to_dict()["estimate"] is None
 
 

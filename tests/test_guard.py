@@ -186,3 +186,15 @@ def test_fireflies_that_are_gone_were_an_error_of_the_denoised_image() -> None:
     assert estimate.standard_error == pytest.approx(0.25 * 0.04 / 0.08), "of one minus 0.02 over the error before"
     huge = Estimate(0.5, 1e36, 1e36, 0.0, 0.0, improved=False)
     assert huge.without(1e3, 1e3) is huge, "no gain is claimed that rounding hides"
+
+
+def test_an_error_that_nothing_judges_makes_a_claim_smaller() -> None:
+    claimed = Estimate(1.0, 0.2, 0.1, -0.5, 0.1, improved=True)
+    told = claimed.with_unjudged(0.3)
+    assert (told.denoised, told.corrected, told.improved) == (pytest.approx(0.5), pytest.approx(0.4), True)
+    assert told.change == pytest.approx(0.4 / 0.5 - 1)
+    assert told.standard_error == pytest.approx(0.1 * 0.2 / 0.5)
+    assert claimed.with_unjudged(0.0) == claimed
+    nothing = Estimate(0.0, 0.0, 0.0, 0.0, 0.0, improved=False)
+    assert nothing.with_unjudged(0.0) == nothing
+    assert claimed.with_unjudged(1e30).change < 0, "what was improved stays so"

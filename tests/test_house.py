@@ -11,12 +11,12 @@ import selfcorrect
 
 PACKAGE = Path(selfcorrect.__file__).parent
 ORDER = (
-    {"errors", "publish", "buffers", "settings", "words"},
+    {"errors", "publish", "buffers", "settings", "start", "words"},
     {"image"},
     {"kernel"},
     {"frame", "exr"},
     {"stages", "pooling"},
-    {"guard", "fireflies", "independence", "metrics"},
+    {"guard", "fireflies", "independence", "lone_pixels", "metrics"},
     {"correct", "candidates", "history", "aovs"},
     {"aov_channels"},
     {"files", "facts"},

@@ -4,8 +4,9 @@
     python scripts/bench/fuzz.py --seconds 3600 --mutants 5000 --seed 1
 
 Mutant number N of a seed is always the same: `--only N` makes it again and keeps its files. A worker process calls
-the command in process, under a limit of memory; a mutant that takes longer than its limit, or ends the worker, is
-counted and the worker is started anew. Exit code 1 where anything was found.
+the command in process, under a limit of memory; a mutant that works for longer than its limit, or ends the worker, is
+counted and the worker is started anew. Ctrl-C ends it with the table of what was tried so far. Exit code 1 where
+anything was found.
 """
 
 import argparse
@@ -55,7 +56,8 @@ LAYOUTS = ("scan lines", "tiles", "two parts", "part per pass")
 COMMANDS = ("inspect", "compare", "frame", "sequence")
 SHARES = (0.72, 0.14, 0.10, 0.04)  # of the mutants, by what each command costs
 MEMORY = 1536 * 2**20  # bytes beyond what the worker takes at its start
-LIMIT = 60.0  # seconds for one mutant
+LIMIT = 60.0  # seconds of the processor for one mutant: on a busy machine a slow one is no hang
+STUCK = 900.0  # seconds on the clock, for what waits and works no more
 FAST = "--steps 1 --warm-steps 1 --patch 8 --batch 1 --window 3 --layers 2 --filters 2 --denoiser box --threads 1"
 ODD = (0, 1, 2, 3, 7, 255, 2**15, 2**16, 2**24, 2**31 - 1, -1, -2, -(2**31))
 FLOATS = (0.0, -1.0, 1e-45, 1e-30, 65504.0, 1e30, 3e38, float("nan"), float("inf"), float("-inf"))
@@ -314,15 +316,29 @@ def worker(seed: int, first: int) -> Iterator["subprocess.Popen[bytes]"]:
             process.stdout.close()
 
 
-def mutants(seed: int, seconds: float, most: int) -> Iterator[tuple[int, Found]]:
-    """Number and fate of mutants until the time is up, counted from the first one's."""
-    end, number = float("inf"), 0
-    while number < most and time.monotonic() < end:
+def answered(process: "subprocess.Popen[bytes]") -> bool:
+    """Whether the worker has something to say, be it that it is gone, within the limits from now on."""
+    worked, start = spent(process.pid), time.monotonic()
+    while time.monotonic() - start < STUCK and spent(process.pid) - worked < LIMIT:
+        if select.select([process.stdout], [], [], 0.5)[0]:
+            return True
+    return False
+
+
+def spent(process: int) -> float:
+    """Seconds of the processor that a process has taken."""
+    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def mutants(seed: int, seconds: float, most: int, first: int = 0) -> Iterator[tuple[int, Found]]:
+    """Number and fate of so many mutants from a first one on, or until the time is up, counted from its fate."""
+    end, number = float("inf"), first
+    while number < first + most and time.monotonic() < end:
         with worker(seed, number) as process:
             assert process.stdout is not None
-            started = LIMIT  # for its imports
-            while number < most and time.monotonic() < end:
-                ready, _, _ = select.select([process.stdout], [], [], LIMIT + started)
+            while number < first + most and time.monotonic() < end:
+                ready = answered(process)
                 line = process.stdout.readline() if ready else b""
                 command, damage = ("", "") if line else _kind(seed, number)
                 if line:
@@ -333,7 +349,7 @@ def mutants(seed: int, seconds: float, most: int) -> Iterator[tuple[int, Found]]
                     found = Found(command, damage, "hang", f"longer than {LIMIT:.0f} s")
                 end = min(end, time.monotonic() + seconds)
                 yield number, found
-                number, started = number + 1, 0.0
+                number += 1
                 if not line:
                     break
 
@@ -359,6 +375,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--mutants", type=int, default=10**9, help="most of them")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="go on from this one")
     parser.add_argument("--only", type=int, metavar="N", help="this one, in this process; its files stay")
     parser.add_argument("--work", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -370,12 +387,13 @@ def main() -> int:
         print(*one(options.seed, options.only, folder), sep="\n")
         return 0
     every = []
-    for number, found in mutants(options.seed, options.seconds, options.mutants):
-        every.append(found)
-        if found.outcome not in GOOD:
-            print(f"{number}: {found}", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        for number, found in mutants(options.seed, options.seconds, options.mutants, options.first):
+            every.append(found)
+            if found.outcome not in GOOD:
+                print(f"{number}: {found}", flush=True)
     bad = sum(found.outcome not in GOOD for found in every)
-    print(table(every), f"{len(every)} mutants of seed {options.seed}, {bad} bad", sep="\n")
+    print(table(every), f"{len(every)} mutants of seed {options.seed} from {options.first} on, {bad} bad", sep="\n")
     return int(bad > 0 or not every)
 
 

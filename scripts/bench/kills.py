@@ -26,6 +26,7 @@ from selfcorrect import cli, exr
 from selfcorrect.errors import FileError
 
 FRAMES = 3
+HANG = 900.0  # seconds: on a busy machine a run of one second takes minutes
 
 
 def child(folder: Path) -> int:
@@ -80,7 +81,7 @@ def trial(folder: Path, sent: signal.Signals, moment: float) -> str:
     process = child(folder)
     time.sleep(moment)
     os.kill(process, sent)
-    status = ended(process, 60.0)
+    status = ended(process, HANG)
     if status is None:
         os.kill(process, signal.SIGKILL)
         os.waitpid(process, 0)
@@ -101,7 +102,7 @@ def interrupted(folder: Path, status: int) -> str:
 
 def resumed(folder: Path) -> str:
     """Whether the next run makes whole what a killed one left."""
-    status = ended(child(folder), 60.0)
+    status = ended(child(folder), HANG)
     if status is None or os.waitstatus_to_exitcode(status):
         return "the next run failed"
     if left_behind(folder) or len(list((folder / "out").glob("x.*.exr"))) < FRAMES:
@@ -123,7 +124,7 @@ def main() -> int:
         (folder / "out").mkdir()
         write_halves(folder, FRAMES)
         start = time.monotonic()
-        ended(child(folder), 120.0)
+        ended(child(folder), HANG)
         whole = time.monotonic() - start
         print(f"a run takes {whole:.2f} s; signals come after 0 to {whole:.2f} s", flush=True)
         counts: Counter[tuple[str, str]] = Counter()

@@ -56,7 +56,7 @@ def taken(frames: int, folder: Path) -> Taken:
 
 
 def soak(frames: int, folder: Path) -> list[Taken]:
-    """Correct a shot in this process; what it held on the way."""
+    """Correct a shot in this process; what it held on the way, a row of which is printed as it is taken."""
     for name in ("out", "tmp"):
         (folder / name).mkdir()
     tempfile.tempdir = str(folder / "tmp")
@@ -68,7 +68,8 @@ def soak(frames: int, folder: Path) -> list[Taken]:
         nonlocal done
         done += told["outcome"] == "written"
         if done % EVERY == 0:
-            rows.append(taken(done, folder))
+            rows.append(row := taken(done, folder))
+            print(f"| {row.frames} | {row.memory:.1f} | {row.descriptors} | {row.threads} | {row.files} |", flush=True)
 
     sequence.answer = count  # in place of lines on stdout
     given = ["sequence", *(str(folder / f"{half}.####.exr") for half in "ab"), "-o", str(folder / "out" / "x.####.exr")]
@@ -89,11 +90,10 @@ def grown(rows: list[Taken]) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=300)
+    options = parser.parse_args()
+    print("| frames | MiB | descriptors | threads | temporary files |\n|---|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        rows = soak(parser.parse_args().frames, Path(folder))
-    print("| frames | MiB | descriptors | threads | temporary files |\n|---|---|---|---|---|")
-    for row in rows:
-        print(f"| {row.frames} | {row.memory:.1f} | {row.descriptors} | {row.threads} | {row.files} |")
+        rows = soak(options.frames, Path(folder))
     print(f"grown: {', '.join(grown(rows)) or 'nothing'}")
     return bool(grown(rows))
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from selfcorrect import start
 from selfcorrect.cli import bench, combine, compare, completion, demo, frame, inspect, report, sequence, settings
 from selfcorrect.cli.help import Parser
 from selfcorrect.cli.terminal import log, terminable
@@ -17,6 +18,7 @@ _COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, settings
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code is 0, 1 where frames of a shot failed, 2 for input that the user can fix."""
     try:
+        start.begun()
         options = _parser().parse_args(arguments)
         with terminable():
             failed: int | None = options.run(options)

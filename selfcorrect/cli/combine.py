@@ -30,6 +30,7 @@ def _combine(options: argparse.Namespace) -> None:
     start = time.perf_counter()
     exr.check_target(options.output)
     four = files.load_images([*options.independent, *options.correlated])
+    log(*(f"warning: {line}" for line in four.lost))
     image, gamma = uncorrelated.combine(
         four.images[:4],
         four.images[4:],

@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 from selfcorrect import exr, metrics
+from selfcorrect.cli import memory
 from selfcorrect.cli.compare_shot import compare_shot
 from selfcorrect.cli.terminal import answer, log, show
 from selfcorrect.errors import FrameError, SettingsError
@@ -26,6 +27,7 @@ def add(commands: Any) -> None:
         action="store_true",
         help="names hold #### for the frame number: errors of every frame and of the change from frame to frame",
     )
+    parser.add_argument("--maxmem", metavar="SIZE", help="refuse images that need more memory, such as 6G")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.set_defaults(run=_compare)
 
@@ -36,7 +38,10 @@ def _compare(options: argparse.Namespace) -> None:
     if options.shot:
         compare_shot(options)
         return
-    check_alike([path for path in (options.image, options.reference, options.reference_b, options.weight) if path])
+    paths = [path for path in (options.image, options.reference, options.reference_b, options.weight) if path]
+    check_alike(paths)
+    if options.maxmem is not None:
+        memory.check_compared(memory.parse_size(options.maxmem), paths)
     image, shown = exr.load_picture(options.image)
     half = exr.load_half(options.reference)
     reference, taken = half.buffers["color"], half.taken["color"]

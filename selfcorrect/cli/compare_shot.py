@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from selfcorrect import exr, metrics
+from selfcorrect.cli import memory
 from selfcorrect.cli.terminal import answer, show
 from selfcorrect.errors import FileError, FrameError
 from selfcorrect.exr.limits import check_alike
@@ -54,6 +55,8 @@ def _frames(options: argparse.Namespace) -> Iterator[_Frame]:
         if options.weight is not None:
             paths.append(fill(options.weight, number))
         check_alike([image, *paths])
+        if options.maxmem is not None:  # the frame before is held beside it
+            memory.check_compared(memory.parse_size(options.maxmem), [image, *paths] * 2)
         a, b, *smooth = (torch.from_numpy(exr.load_half(path).buffers["color"]) for path in paths)
         weight = smooth[0] if smooth else mean((a, b))
         yield _Frame(number, torch.from_numpy(exr.load_picture(image)[0]), (a, b), weight)

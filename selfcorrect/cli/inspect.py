@@ -5,12 +5,15 @@ from typing import Any
 
 from selfcorrect import exr
 from selfcorrect.cli import memory
-from selfcorrect.cli.terminal import answer, show
+from selfcorrect.cli.terminal import answer, log, show
+from selfcorrect.exr.file import headers
+from selfcorrect.exr.limits import stored_bytes
 
 __all__ = ["add"]
 
-_MOST = "8G"
-"""A file of some kilobytes may claim any number of pixels; 8K with forty channels of half floats takes 2.5 GiB."""
+# A file of some kilobytes may claim any number of pixels; those of renders take up to so many times their file.
+_MOST = memory.GIB // 4
+_BLOWN_UP = 32
 
 
 def add(commands: Any) -> None:
@@ -19,17 +22,22 @@ def add(commands: Any) -> None:
     parser.add_argument("file", metavar="FILE.exr", help="any OpenEXR file")
     parser.add_argument(
         "--maxmem",
-        default=_MOST,
         metavar="SIZE",
-        help="refuse a file of more pixels by its header (default: %(default)s)",
+        help="of pixels that take more, tell only what the header says (default: 256M, or 32 times the file's size)",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.set_defaults(run=_inspect)
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    memory.check_held(memory.parse_size(options.maxmem), options.file)
-    found = exr.inspect(options.file)
+    taken, size = stored_bytes(options.file), headers(options.file.partition("::")[0])[1]
+    most = max(_MOST, _BLOWN_UP * size) if options.maxmem is None else memory.parse_size(options.maxmem) - memory.BASE
+    found = exr.inspect(options.file, most=int(most))
+    if taken > most:
+        log(
+            f"warning: {options.file}: its pixels are not read: by its header they take {taken / memory.GIB:.1f}G; "
+            f"--maxmem {memory.rounded(taken + memory.BASE)} reads them"
+        )
     if options.json:
         answer(found.to_dict())
     else:

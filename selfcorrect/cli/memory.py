@@ -7,6 +7,7 @@ command.
 import argparse
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -25,14 +26,29 @@ from selfcorrect.files import Sources
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.patches import crops
 
-__all__ = ["Needs", "check_held", "fits", "needs", "parse_size", "reduced", "scratch_within"]
+__all__ = [
+    "BASE",
+    "GIB",
+    "Needs",
+    "check_compared",
+    "fits",
+    "fitted",
+    "needs",
+    "parse_size",
+    "reduced",
+    "rounded",
+    "scratch_within",
+]
 
 GIB = 2**30
-_BASE = 0.35 * GIB  # the interpreter, torch, the OpenEXR library and OIDN's weights
+BASE = 0.35 * GIB
+"""The interpreter, torch, the OpenEXR library and OIDN's weights."""
+
 _WORK = 0.6 * GIB  # one strip of tiles in every form, the network's for one batch, and what the allocator keeps
 _OIDN = 0.2 * GIB  # its weights and buffers beside the scratch that it is told of
 _LEAST_SCRATCH = 0.4 * GIB  # its smallest tile takes 0.34 GiB
 _BYTES = {0: 4, 1: 2, 2: 4}  # uint, half, float
+_COMPARED = 250  # bytes of a pixel that the metrics take beside the images
 _RGB = 12  # bytes of a pixel of three float32 channels
 _CANDIDATES = 2  # OIDN's other modes
 _MOTIONS = 36  # bytes of a pixel: offsets and whether they are known, to the frames within two and back
@@ -80,10 +96,9 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
     needed = _with_denoiser(found)
     stage = max(needed, key=lambda name: needed[name])
     if needed[stage] > limit:
-        least = math.ceil(10 * needed[stage] / GIB) / 10
         raise SettingsError(
-            f"{sources.a}: expected --maxmem of at least {least:.1f}G for a frame of this size and these channels "
-            f"(most of it to {stage}), but got {limit / GIB:.1f}G"
+            f"{sources.a}: expected --maxmem of at least {rounded(needed[stage])} for a frame of this size and these "
+            f"channels (most of it to {stage}), but got {limit / GIB:.1f}G"
         )
     return int(limit - found.denoise - _OIDN)
 
@@ -166,7 +181,7 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = 
         if settings.frame_radius and settings.guard:
             kept = 2 * half + 6 * image + 3 * aids + _MOTIONS * pixels  # also what was gathered and denoised again
             around += (2 * settings.frame_radius + 2) * kept + 3 * image
-    both, base = 2 * half, _BASE + around
+    both, base = 2 * half, BASE + around
     correct = both + 3 * image + max(training, image + evidence) + 2 * beyond + candidates
     return Needs(
         read=base + half + held + max(stored, half) + beyond,
@@ -182,21 +197,32 @@ def _of_aovs(pixels: int, count: int, half: float, held: float) -> float:
     image = pixels * _RGB
     kept = 2 * image * (count / 3)
     working = 12 * image  # denoised halves and their mean, the gaps and sums, the guides of each, one AOV's evidence
-    return _BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
+    return BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
 
 
-def check_held(limit: int, path: str) -> None:
-    """Refuse a file whose pixels do not fit into so many bytes, by its header.
+def rounded(size: float) -> str:
+    """A size for people, rounded up.
+
+    >>> rounded(1.42 * GIB)
+    '1.5G'
+    """
+    return f"{math.ceil(10 * size / GIB) / 10:.1f}G"
+
+
+def check_compared(limit: int, paths: Sequence[str]) -> None:
+    """Refuse to compare images that do not fit into so many bytes, by their headers.
 
     Raises:
-        FileError: the file is missing or no OpenEXR file.
-        SettingsError: it does not fit.
+        FileError: a file is missing or no OpenEXR file.
+        SettingsError: they do not fit.
     """
-    needed = _BASE + stored_bytes(path)
+    sizes = [part.data_window.size for part in headers(paths[0].partition("::")[0])[0]]
+    pixels = max(height * width for height, width in sizes)
+    needed = BASE + pixels * (_RGB * len(paths) + _COMPARED) + max(map(_with_siblings, paths))
     if needed > limit:
         raise SettingsError(
-            f"{path}: expected --maxmem of at least {math.ceil(10 * needed / GIB) / 10:.1f}G for the pixels that its "
-            f"header claims, but got {limit / GIB:.1f}G"
+            f"{paths[0]}: expected --maxmem of at least {rounded(needed)} to compare the pixels that the headers "
+            f"claim, but got {limit / GIB:.1f}G"
         )
 
 

@@ -226,8 +226,8 @@ class Runner:
         self._told = dict(known.channels)
         for line in denoised.origin.plan.lines:
             log(line)
-        for doubt in doubts(frame):
-            log(f"warning: {doubt}")
+        for warning in (*denoised.origin.lost, *doubts(frame)):
+            log(f"warning: {warning}")
         if known.denoiser != "given":
             log(f"denoiser: {known.denoiser}")
             frame, promises = with_candidates(frame, self._further, every=self.settings.candidates == "all")

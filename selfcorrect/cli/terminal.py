@@ -18,7 +18,7 @@ __all__ = ["EndOnInterrupt", "Progress", "answer", "log", "show", "terminable"]
 
 def log(*lines: str) -> None:
     """Lines on stderr, in one piece; what files put into them is escaped. Where nothing can be told, so be it."""
-    if sys.stderr is None:  # closed before Python began; print would take stdout
+    if sys.stderr is None or not lines:  # closed before Python began; print would take stdout
         return
     with OUTPUT, contextlib.suppress(OSError, ValueError):
         _print(sys.stderr, lines)

@@ -142,11 +142,15 @@ def float_type(file: ExrFile, name: str) -> np.dtype[Any]:
     return dtype
 
 
-def headers(file: str) -> tuple[list[header.Header], int]:
+def headers(file: str, *, plausible: bool = False) -> tuple[list[header.Header], int]:
     """The headers of all parts of a file, and its size in bytes; no pixel is read.
 
+    Args:
+        file: without a layer.
+        plausible: also check them as :func:`read` does, against the chunk tables and the file's size.
+
     Raises:
-        FileError: the file is missing or no OpenEXR file, or its header is not complete.
+        FileError: the file is missing or no OpenEXR file, or its header is not complete, or not ``plausible``.
     """
     try:
         _check_regular(file)
@@ -155,7 +159,10 @@ def headers(file: str) -> tuple[list[header.Header], int]:
             if not size:
                 return header.parse(b"", file)[0], 0
             with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as whole, memoryview(whole) as data:
-                return header.parse(data, file)[0], size
+                found, tables = header.parse(data, file)
+                if plausible:
+                    header.check(found, tables, data, file)
+                return found, size
     except IsADirectoryError:
         raise FileError(f"{file}: expected an OpenEXR file, but got a folder") from None
     except OSError as error:

@@ -29,7 +29,7 @@ _ANY = 65536.0
 """The other compressions have no such bound; a black 4K frame came to 40,000 (measured, HTJ2K)."""
 
 _COMPRESSIONS = (
-    ("none", 1, 1.0),
+    ("NO", 1, 1.0),
     ("RLE", 1, 64.0),
     ("ZIPS", 1, 1032.0),
     ("ZIP", 16, 1032.0),
@@ -106,6 +106,17 @@ class Header:
         """The part's name; empty in most single-part files."""
         attribute = self.attributes.get("name")
         return "" if attribute is None else attribute.data.decode("utf-8", "replace")
+
+    @property
+    def storage(self) -> str:
+        """What the OpenEXR library calls the way in which flat pixels are stored."""
+        return "tiledimage" if self.tiled else "scanlineimage"
+
+    @property
+    def compression_name(self) -> str:
+        """What the OpenEXR library calls the compression; its number where that is not known."""
+        known = self.compression < len(_COMPRESSIONS)
+        return _COMPRESSIONS[self.compression][0] if known else str(self.compression)
 
     @property
     def views(self) -> list[str]:
@@ -199,7 +210,7 @@ def _channels(data: bytes) -> tuple[Channel, ...]:
     return tuple(channels)
 
 
-def check(headers: Sequence[Header], tables: int, data: bytes, file: str) -> None:
+def check(headers: Sequence[Header], tables: int, data: bytes | memoryview, file: str) -> None:
     """Refuse what cannot be read, or not without harm, by the header and the chunk tables alone.
 
     A data window is too large where it has more than 2³¹ pixels, or more bytes than a file of this length can
@@ -234,7 +245,7 @@ def check(headers: Sequence[Header], tables: int, data: bytes, file: str) -> Non
     expected = complete = 0
     for header in headers:
         count = _chunks(header)
-        table = np.frombuffer(data[tables : tables + 8 * count], dtype=np.uint8)
+        table = np.frombuffer(bytes(data[tables : tables + 8 * count]), dtype=np.uint8)
         offsets = table[: table.size // 8 * 8].view("<u8")
         expected += count
         complete += int(np.count_nonzero((offsets > tables) & (offsets < len(data))))

@@ -8,28 +8,35 @@ import numpy as np
 
 from selfcorrect.errors import ChannelError
 from selfcorrect.exr import channels
-from selfcorrect.exr.file import Pixels, read
+from selfcorrect.exr.file import Pixels, headers, read
 from selfcorrect.exr.header import Window
+from selfcorrect.exr.limits import stored_bytes
 
 __all__ = ["ChannelReport", "Inspection", "PartReport", "inspect"]
 
 _STRIP = 64  # rows
+_DTYPES = ("uint32", "float16", "float32")
 
 
 @dataclass(frozen=True)
 class ChannelReport:
-    """One channel: full name, type, count of NaN and of infinite pixels, and the range of the finite ones."""
+    """One channel: full name, type, count of NaN and of infinite pixels, and the range of the finite ones.
+
+    All but name and type is None where the pixels were not read.
+    """
 
     name: str
     dtype: str
-    nan: int
-    inf: int
-    minimum: float | None
-    maximum: float | None
-    mean: float | None
+    nan: int | None = None
+    inf: int | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    mean: float | None = None
 
     def line(self) -> str:
         """Text for people."""
+        if self.nan is None:
+            return f"{self.name}: {self.dtype}"
         bad = "".join(f", {count} {kind}" for kind, count in (("NaN", self.nan), ("infinite", self.inf)) if count)
         if self.mean is None:
             return f"{self.name}: {self.dtype}, no finite pixel{bad}"
@@ -89,38 +96,56 @@ class Inspection:
         return text if self.problem is None else [*text, self.problem]
 
 
-def inspect(path: str | Path) -> Inspection:
+def inspect(path: str | Path, *, most: int | None = None) -> Inspection:
     """Say what a file holds and which channels would be used for what.
 
     Args:
         path: the file, or ``FILE.exr::LAYER``.
+        most: bytes that its pixels may take, by its header, to be read; more are left unread, and only what the header
+            says is told. By default all are read.
 
     Raises:
         FileError: the file cannot be read.
     """
-    file = read(path)
-    names = file.channel_names
-    parts = []
-    for index, part in enumerate(file.parts):
-        reports = [_report(name, file.pixels(name)) for name in names if file.place(name)[0] == index]
-        parts.append(
-            PartReport(
-                part.name,
-                part.header["type"].name,
-                part.header["compression"].name.removesuffix("_COMPRESSION"),
-                part.data_window,
-                part.display_window,
-                tuple(reports),
-            )
-        )
+    if most is not None and stored_bytes(str(path)) > most:
+        parts, names, named, layer = _by_header(str(path))
+    else:
+        parts, names, named, layer = _by_pixels(path)
     taken, siblings, problem = {}, {}, None
     try:
-        taken = channels.choose(names, file=file.path, layer=file.layer)
-        found = channels.siblings(file.path)
+        taken = channels.choose(names, file=named, layer=layer)
+        found = channels.siblings(named)
         siblings = {role: str(sibling) for role, sibling in found.items() if role not in taken}
     except ChannelError as error:
         problem = str(error)
-    return Inspection(file.path, tuple(parts), tuple(channels.layers(names)), taken, siblings, problem)
+    return Inspection(named, parts, tuple(channels.layers(names)), taken, siblings, problem)
+
+
+_Found = tuple[tuple[PartReport, ...], list[str], str, str | None]
+"""Parts, full names of all channels, the file without the layer, the layer."""
+
+
+def _by_pixels(path: str | Path) -> _Found:
+    file = read(path)
+    parts = []
+    for index, part in enumerate(file.parts):
+        reports = [_report(name, file.pixels(name)) for name in file.channel_names if file.place(name)[0] == index]
+        storage, compression = part.header["type"].name, part.header["compression"].name.removesuffix("_COMPRESSION")
+        windows = part.data_window, part.display_window
+        parts.append(PartReport(part.name, storage, compression, *windows, tuple(reports)))
+    return tuple(parts), file.channel_names, file.path, file.layer
+
+
+def _by_header(path: str) -> _Found:
+    file, _, layer = path.partition("::")
+    found, _ = headers(file, plausible=True)
+    names = channels.full_names([(part.name, [c.name for c in part.channels]) for part in found], found[0].views)
+    parts = []
+    for part, full in zip(found, names, strict=True):
+        reports = [ChannelReport(name, _DTYPES[c.type]) for name, c in zip(full, part.channels, strict=True)]
+        windows = part.data_window, part.display_window
+        parts.append(PartReport(part.name, part.storage, part.compression_name, *windows, tuple(reports)))
+    return tuple(parts), [name for full in names for name in full], file, layer or None
 
 
 def _report(name: str, pixels: Pixels) -> ChannelReport:

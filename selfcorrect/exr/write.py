@@ -9,7 +9,8 @@ What the OpenEXR library cannot keep by itself when a file passes through, and w
 - a file of scan lines in no order (a line order that only tiles may have): written from the top;
 - a file with DWA or B44 compression would lose precision in every channel once more: it is written with ZIP;
 - mip and rip maps lose all levels but the first: such files are refused (see :mod:`selfcorrect.exr.header`);
-- standard attributes of another type can be read but not written: such files are refused before the work
+- standard attributes of another type can be read but not written, or are lost without an error (``version`` as a
+  string, ``name`` or ``tiles`` as a number): the first are refused, the second told of, before the work
   (:func:`check_source`).
 
 Sources: https://openexr.com/en/latest/OpenEXRFileLayout.html and trials with OpenEXR 3.5.
@@ -124,18 +125,21 @@ def _encode(
     return data
 
 
-def check_source(source: ExrFile) -> None:
+def check_source(source: ExrFile) -> list[str]:
     """Refuse a file whose attributes could not be written back; to be called before long work.
 
+    Returns:
+        A line for each attribute that the library reads but writes otherwise or not at all: it will be lost.
+
     Raises:
-        FileError: an attribute cannot be written; the message names the first one.
+        FileError: an attribute keeps the file from being written; the message names the first one.
     """
-    together = _refusal([(part, _attributes(part)) for part in source.parts])
+    written, together = _trial([(part, _attributes(part)) for part in source.parts])
     if together is None:
-        return
+        return _lost(source, written)
     for part in source.parts:
         for name, value in _attributes(part).items():
-            reason = _refusal([(part, {name: value})])
+            _, reason = _trial([(part, {name: value})])
             if reason is not None:
                 kind = part.attributes[name].type if name in part.attributes else type(value).__name__
                 raise FileError(
@@ -145,19 +149,35 @@ def check_source(source: ExrFile) -> None:
     raise FileError(f"{source.path}: expected attributes that can be written back, but got: {together}; write it anew")
 
 
-def _refusal(headers: Sequence[tuple[Part, Mapping[str, Any]]]) -> str | None:
-    """Why the library does not write these attributes around one pixel; None where it does."""
+def _trial(headers: Sequence[tuple[Part, Mapping[str, Any]]]) -> tuple[bytes, str | None]:
+    """What the library writes of these attributes around one pixel; or nothing, and why."""
     pixel = np.zeros(2, np.int32), np.zeros(2, np.int32)
     parts = [
         OpenEXR.Part({**attributes, "dataWindow": pixel}, {"Y": np.zeros((1, 1), np.float32)}, part.name)
         for part, attributes in headers
     ]
+    stream = io.BytesIO()
     try:
         with quiet():
-            OpenEXR.File(parts).write(io.BytesIO())
+            OpenEXR.File(parts).write(stream)
     except LIBRARY_ERRORS as error:
-        return one_line(error)
-    return None
+        return b"", one_line(error)
+    return stream.getvalue(), None
+
+
+def _lost(source: ExrFile, written: bytes) -> list[str]:
+    """A line for each attribute of which neither the library nor :func:`header.restore` brings back the bytes."""
+    lines = []
+    for part, now in zip(source.parts, header.parse(written, source.path)[0], strict=True):
+        for name, before in part.attributes.items():
+            after = now.attributes.get(name)
+            own = name in _REWRITTEN | {"type"} or (name == "lineOrder" and _disordered(part))
+            if not own and (after is None or (after.type, len(after.data)) != (before.type, len(before.data))):
+                what = "left out" if after is None else f"replaced by the {after.type} that the format has there"
+                lines.append(
+                    f"{source.path}: attribute '{name}' of type {before.type} cannot be written back and is {what}"
+                )
+    return lines
 
 
 def _disordered(part: Part) -> bool:

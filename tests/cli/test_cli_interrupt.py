@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from helpers.commands import BOX, call, refused
 
-from selfcorrect import cli
+from selfcorrect import cli, start
 
 ENDLESS = [
     "--steps",
@@ -73,6 +73,47 @@ def test_a_second_interrupt_writes_nothing(
     assert signal.getsignal(signal.SIGINT) is before
     assert out.read_bytes() == b"what was there before"
     assert sorted(os.listdir(tmp_path)) == ["a.exr", "b.exr", "out.exr"]
+
+
+LOADED = ["libc10", "libtorch_cpu", "libtorch_python", "_multiarray_umath", "_safetensors_rust", "OpenEXR"]
+"""Libraries that the imports load one after the other: each is a moment of the start."""
+
+
+@pytest.mark.parametrize("library", LOADED)
+@pytest.mark.parametrize("how", ["module", "script"])
+def test_an_interrupt_during_the_imports_ends_quietly(library: str, how: str, halves: tuple[Path, Path]) -> None:
+    script = Path(sys.executable).with_name("selfcorrect")
+    start = {"module": [sys.executable, "-m", "selfcorrect"], "script": [str(script)]}[how]
+    process = subprocess.Popen(
+        [*start, "inspect", str(halves[0])], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    mapped = Path(f"/proc/{process.pid}/maps")
+    end = time.monotonic() + 120
+    while library not in mapped.read_text(encoding="utf-8", errors="replace") and time.monotonic() < end:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=120) == ("", "")
+    assert process.returncode == 130
+
+
+def test_the_package_leaves_signals_to_whoever_imports_it() -> None:
+    code = "import signal; before = signal.getsignal(2); import selfcorrect.cli; assert signal.getsignal(2) is before"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+@pytest.mark.parametrize("ignored", [True, False])
+def test_the_command_ignores_what_its_parent_has_it_ignore(ignored: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As nohup and a shell's & do."""
+    monkeypatch.setattr("sys.argv", ["selfcorrect"])
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+    try:
+        start.begin()
+        assert (signal.getsignal(signal.SIGINT) is signal.SIG_IGN) == ignored
+        start.begun()
+        expected = signal.SIG_IGN if ignored else signal.default_int_handler
+        assert signal.getsignal(signal.SIGINT) is expected
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("text", ["soon", "10x", ""])

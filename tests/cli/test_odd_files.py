@@ -1,6 +1,7 @@
 """What odd files do to the command: one line that names them, nothing else; and the frames beside them go on."""
 
 import io
+import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from helpers.shots import Run, arguments
 
 from selfcorrect import cli, exr, files
 from selfcorrect.errors import printable
+from selfcorrect.exr import header
 
 Captured = pytest.CaptureFixture[str]
 
@@ -153,15 +155,69 @@ def test_nothing_can_be_told_but_the_picture_is_written(
         assert np.isfinite(exr.read(str(tmp_path / f"{name}.exr")).pixels("R")).all()
 
 
+def bomb_of(folder: Path) -> Path:
+    """13 kB that decompress to 12000×10000 pixels, as zeros in HTJ2K do; its chunks are never looked at."""
+    data = raw([("compression", "compression", b"\x0a")], window=(0, 0, 11_999, 9_999))
+    _, tables = header.parse(data, "")
+    chunks = struct.pack("<40Q", *[tables + 320 + 300 * number for number in range(40)])
+    path = folder / "bomb.exr"
+    path.write_bytes(data[:tables] + chunks + bytes(40 * 300))
+    return path
+
+
+def test_inspect_tells_what_the_header_says_of_pixels_that_are_too_many(
+    halves: tuple[Path, Path], tmp_path: Path, capfd: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bomb = bomb_of(tmp_path)
+    assert bomb.stat().st_size < 13_000
+    plain = json.loads(shown(capfd, "inspect", halves[0], "--json")[0])
+    monkeypatch.setattr("selfcorrect.exr.inspection.read", lambda _: pytest.fail("pixels were read"))
+    out, err = shown(capfd, "inspect", bomb)
+    assert "12000×10000 pixels, scanlineimage, HTJ2K256" in out
+    assert out.splitlines()[2:] == ["  B: float16", "  G: float16", "  R: float16", "color: R, G, B"]
+    assert err.endswith("bomb.exr: its pixels are not read: by its header they take 0.7G; --maxmem 1.1G reads them\n")
+    told = json.loads(shown(capfd, "inspect", halves[0], "--maxmem", "100M", "--json")[0])
+    assert [channel["mean"] for channel in told["parts"][0]["channels"]] == [None] * 11
+    unread = dict.fromkeys(("nan", "inf", "minimum", "maximum", "mean"))
+    for part in plain["parts"]:
+        part["channels"] = [channel | unread for channel in part["channels"]]
+    assert told == plain, "all else is as it is of the pixels"
+
+
+def shown(capfd: Captured, *given: object) -> tuple[str, str]:
+    capfd.readouterr()
+    assert cli.main([*map(str, given)]) == 0
+    out, err = capfd.readouterr()
+    return out, err
+
+
+def test_compare_stays_within_maxmem(halves: tuple[Path, Path], capfd: Captured) -> None:
+    assert "relMSE" in shown(capfd, "compare", *halves, "--maxmem", "1G")[0]
+    line = refused(capfd, "compare", *halves, "--maxmem", "100M")
+    assert "a.exr: expected --maxmem of at least 0.4G to compare the pixels" in line
+    shot = [str(half).replace(".exr", ".####.exr") for half in halves]
+    for half in halves:
+        half.rename(str(half).replace(".exr", ".0001.exr"))
+    assert "expected --maxmem of at least" in refused(capfd, "compare", "--shot", *shot, "--maxmem", "100M")
+
+
+def test_compare_judges_giants_alike_by_their_headers(
+    tmp_path: Path, capfd: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bomb = bomb_of(tmp_path)
+    monkeypatch.setattr("selfcorrect.exr.load.read", lambda _: pytest.fail("pixels were read"))
+    line = refused(capfd, "compare", bomb, bomb, "--maxmem", "6G")
+    assert "bomb.exr: expected --maxmem of at least 31.7G to compare" in line
+
+
 def test_inspect_and_compare_judge_headers_before_pixels(
     halves: tuple[Path, Path], tmp_path: Path, capfd: Captured, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bomb = tmp_path / "bomb.exr"
-    bomb.write_bytes(raw(window=(0, 0, 39_999, 49_999))[:4096])
+    bomb = bomb_of(tmp_path)
     monkeypatch.setattr("selfcorrect.exr.inspection.read", lambda _: pytest.fail("pixels were read"))
-    line = refused(capfd, "inspect", bomb)
-    assert "bomb.exr: expected --maxmem of at least 11.6G for the pixels that its header claims" in line
-    assert "expected --maxmem of at least 0.4G" in refused(capfd, "inspect", halves[0], "--maxmem", "100M")
+    damaged = tmp_path / "damaged.exr"
+    damaged.write_bytes(raw(window=(0, 0, 39_999, 49_999))[:4096])
+    assert "expected a file that can hold the 40000×50000 pixels" in refused(capfd, "inspect", damaged)
     monkeypatch.setattr("selfcorrect.exr.load.read", lambda _: pytest.fail("pixels were read"))
     for more in ([bomb], [halves[1], bomb], [halves[1], "--weight", bomb]):
         assert "bomb.exr: expected 30x24 pixels like" in refused(capfd, "compare", halves[0], *more)

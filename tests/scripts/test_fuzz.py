@@ -51,10 +51,12 @@ def test_what_is_wrong_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("code", "outcome"), [("import os; os.abort()", "crash"), ("import time; time.sleep(9)", "hang")]
+    ("code", "outcome"),
+    [("import os; os.abort()", "crash"), ("while True: pass", "hang"), ("import time; time.sleep(999)", "hang")],
 )
 def test_a_worker_that_dies_or_hangs_is_counted(code: str, outcome: str, monkeypatch: pytest.MonkeyPatch) -> None:
     popen = fuzz.subprocess.Popen
     monkeypatch.setattr("fuzz.LIMIT", 1.0)
+    monkeypatch.setattr("fuzz.STUCK", 5.0 if "sleep" in code else 900.0)
     monkeypatch.setattr("subprocess.Popen", lambda command, **how: popen([command[0], "-c", code], **how))
     assert [one.outcome for _, one in fuzz.mutants(seed=0, seconds=60, most=1)] == [outcome]
