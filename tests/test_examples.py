@@ -15,14 +15,13 @@ import selfcorrect
 
 ROOT = Path(__file__).parents[1]
 HOWTO = ROOT / "scripts" / "howto"
+EXAMPLE = re.compile("^ *>>> ", re.MULTILINE)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
 def named(package: Path) -> list[str]:
     """Modules of a package that have an example."""
-    paths = [
-        path for path in package.rglob("*.py") if "\n    >>> " in (text := path.read_text("utf-8")) or "\n>>> " in text
-    ]
+    paths = [path for path in package.rglob("*.py") if EXAMPLE.search(path.read_text(encoding="utf-8"))]
     parts = [path.relative_to(package.parent).with_suffix("").parts for path in paths]
     return sorted(".".join(names).removesuffix(".__init__") for names in parts)
 

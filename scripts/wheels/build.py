@@ -112,7 +112,7 @@ set(CMAKE_SYSTEM_PROCESSOR {target.processor})
 set(CMAKE_CXX_COMPILER {folder}/zig-cxx)
 set(CMAKE_AR {folder}/zig-ar)
 set(CMAKE_RANLIB {folder}/zig-ranlib)
-set(CMAKE_FIND_ROOT_PATH_MODE_LIBRARY ONLY)
+set(CMAKE_CXX_FLAGS_INIT "-include cstdio")  # nanobind counts on some other header to bring it; libc++'s do not
 """
 
 
