@@ -127,7 +127,7 @@ def correct(
         DeviceError: the device is out of memory.
 
     Warns:
-        MissingKernelsWarning: once in a process, on a CPU without the compiled kernels: 30 times as long, or more.
+        MissingKernelsWarning: once in a process, on a CPU without the compiled kernels: about 30 times as long.
     """
     if frame.color[0].device.type == "cpu":
         warn_if_missing()

@@ -49,7 +49,7 @@ def missing() -> str:
     if installed():
         return ""
     return (
-        f"the compiled kernels are not installed ({_reason}), and plain torch is 30 times slower or more; "
+        f"the compiled kernels are not installed ({_reason}), and plain torch is about 30 times slower; "
         "install the wheel for this machine, or a C++ compiler (g++ or clang++) and run in the folder of selfcorrect: "
         "pip install --force-reinstall --no-deps ."
     )
