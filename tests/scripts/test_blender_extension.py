@@ -80,7 +80,7 @@ def found(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
         capture_output=True,
         text=True,
         check=False,
-        timeout=600,
+        timeout=1800,
         env=environment,
     )
     assert result.returncode == 0, result.stdout + result.stderr

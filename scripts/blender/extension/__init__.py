@@ -175,7 +175,8 @@ class SELFCORRECT_OT_render(bpy.types.Operator):
 
     def cancel(self, context):
         """Blender itself ends the operator, for another file or to quit."""
-        context.workspace.status_text_set(None)
+        if context.workspace is not None:  # there is none left where Blender quits
+            context.workspace.status_text_set(None)
         self._clean()
 
     def _begin(self, context):
