@@ -16,6 +16,7 @@ from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.independence import dependence
+from selfcorrect.kernel.compiled import warn_if_missing
 from selfcorrect.lone_pixels import lone_pixels, set_aside, unjudged
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.infer import SIDE
@@ -128,7 +129,12 @@ def correct(
         FileError: the weights of a trained stage are not there or do not fit.
         SettingsError: a stage stands where it cannot.
         DeviceError: the device is out of memory.
+
+    Warns:
+        MissingKernelsWarning: once in a process, on a CPU without the compiled kernels: about 30 times as long.
     """
+    if frame.color[0].device.type == "cpu":
+        warn_if_missing()
     settings = settings or Settings.preset(Settings.default())
     given, *more = frame.candidates
     if opened is None:

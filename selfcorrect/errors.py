@@ -47,7 +47,7 @@ def packages_of(extra: str) -> list[str]:
 
 
 def printable(text: str) -> str:
-    """Text for a log: what a file put into it moves no cursor and begins no line of its own.
+    r"""Text for a log: what a file put into it moves no cursor and begins no line of its own.
 
     Control characters, line separators and characters that turn the direction of writing are escaped, as is what is
     not Unicode; line breaks are left to the caller.

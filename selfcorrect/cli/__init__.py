@@ -1,5 +1,6 @@
 """The command. Nothing outside this package prints: results go to stdout, everything else to stderr."""
 
+import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 
@@ -9,6 +10,7 @@ from selfcorrect.cli.help import Parser
 from selfcorrect.cli.terminal import log, terminable
 from selfcorrect.errors import SelfcorrectError, out_of_memory
 from selfcorrect.exr.file import one_line
+from selfcorrect.kernel.compiled import MissingKernelsWarning
 
 __all__ = ["main"]
 
@@ -17,6 +19,7 @@ _COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, settings
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code is 0, 1 where frames of a shot failed, 2 for input that the user can fix."""
+    warnings.simplefilter("ignore", MissingKernelsWarning)  # the runner tells of it, in a line of the log
     try:
         start.begun()
         options = _parser().parse_args(arguments)

@@ -21,6 +21,7 @@ from selfcorrect.errors import MissingPackageError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.history import Histories, available
 from selfcorrect.independence import doubts
+from selfcorrect.kernel.compiled import installed, missing
 from selfcorrect.settings import Settings
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.stage import Extra, Images
@@ -108,6 +109,8 @@ class Runner:
                 spec: denoisers.create(spec, threads=options.threads, scratch=scratch)
                 for spec in denoisers.variants(self._spec)
             }
+        if not installed():
+            log(f"warning: {missing()}")
         if torch.device(options.device).type != "cpu":
             bound = [stage.name for stage in self._stages if stage.on_cpu]
             bound += [] if self._denoise is None else [f"the denoiser {self.denoiser}"]

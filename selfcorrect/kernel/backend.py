@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect.errors import SettingsError
-from selfcorrect.kernel import _cpu
+from selfcorrect.kernel.compiled import functions, installed, missing
 
 __all__ = ["BACKENDS", "choose", "instruction_set", "instruction_sets"]
 
@@ -43,11 +43,14 @@ def choose(
     """
     kinds = sorted({f"{tensor.dtype} on {tensor.device.type}".removeprefix("torch.") for tensor in tensors})
     compiled = fits and all(tensor.device.type == "cpu" and tensor.dtype in dtypes for tensor in tensors)
+    compiled = compiled and installed()
     if backend is None:
         return "cpu" if compiled else "gpu" if gpu and _on_cuda(tensors) else "reference"
     offered = [name for name in BACKENDS if gpu or name != "gpu"]
     if backend not in offered:
         raise SettingsError(f"expected a backend out of {', '.join(offered)}, but got {backend!r}")
+    if backend == "cpu" and not installed():
+        raise SettingsError(f"expected another backend than cpu: {missing()}")
     if backend == "cpu" and not compiled:
         taken = " or ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
         wanted = f"{taken} on cpu" + (f" and {limit}" if limit else "")
@@ -63,8 +66,8 @@ def _on_cuda(tensors: Sequence[Tensor]) -> bool:
 
 
 def instruction_sets() -> list[str]:
-    """Names of the compiled variants that this processor can run, slowest first."""
-    return list(_cpu.instruction_sets())
+    """Names of the compiled variants that this processor can run, slowest first; none where they are not installed."""
+    return list(functions.instruction_sets()) if installed() else []
 
 
 def instruction_set(name: str, known: Sequence[str] = ()) -> str:

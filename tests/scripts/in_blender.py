@@ -80,12 +80,21 @@ class Operator:
 
     def __init__(self):
         real = vars(sys.modules[MODULE].SELFCORRECT_OT_render)
-        for name in ("invoke", "modal", "_begin", "_end", "_failed", "_clean"):
+        for name in ("invoke", "modal", "_begin", "_end", "_failed", "_clean", "_status"):
             setattr(self, name, types.MethodType(real[name], self))
         self.animation, self.reports, self.timers = False, [], 0
+        self.status, self.popups = [], []
 
     def report(self, kind, message):
         self.reports.append(message)
+
+    def status_text_set(self, text):
+        self.status.append(text)
+
+    def popup_menu(self, draw, title, icon):
+        recorder = Recorder()
+        draw(types.SimpleNamespace(layout=recorder), None)
+        self.popups.append([title, icon, *recorder.texts])
 
     def event_timer_add(self, interval, window):
         self.timers += 1
@@ -95,24 +104,35 @@ class Operator:
         self.timers -= timer == "timer"
 
 
-def in_the_event_loop(cancel):
-    """Start as the button does, then one timer event after the other; what all came to."""
+def in_the_event_loop(cancel=""):
+    """Start as the button does, then one timer event after the other; what all came to.
+
+    ``cancel`` is "button" or "escape".
+    """
     operator = Operator()
     manager = types.SimpleNamespace(
         event_timer_add=operator.event_timer_add,
         event_timer_remove=operator.event_timer_remove,
         modal_handler_add=lambda operator: None,
+        popup_menu=operator.popup_menu,
         windows=[],
     )
     context = types.SimpleNamespace(
-        scene=bpy.context.scene, preferences=bpy.context.preferences, window=None, window_manager=manager
+        scene=bpy.context.scene,
+        preferences=bpy.context.preferences,
+        window=None,
+        window_manager=manager,
+        workspace=types.SimpleNamespace(status_text_set=operator.status_text_set),
     )
     tick, mouse = types.SimpleNamespace(type="TIMER"), types.SimpleNamespace(type="MOUSEMOVE")
     answers = [operator.invoke(context, None), operator.modal(context, mouse)]
     seen = [drawn()]
     while (answer := operator.modal(context, tick)) == {"PASS_THROUGH"}:
         if cancel and sys.modules[MODULE].State.job.label:
-            bpy.ops.selfcorrect.cancel()
+            if cancel == "button":
+                bpy.ops.selfcorrect.cancel()
+            else:
+                answers.append(operator.modal(context, types.SimpleNamespace(type="ESC", value="PRESS")))
         time.sleep(0.1)
     answers.append(answer)
     return {
@@ -120,6 +140,8 @@ def in_the_event_loop(cancel):
         "reports": operator.reports,
         "timers": operator.timers,
         "drawn": seen[0],
+        "status": operator.status,
+        "popups": operator.popups,
     }
 
 
@@ -154,15 +176,22 @@ def main():
     len(image.pixels)  # loads it
     found["image"] = {"path": image.filepath, "type": image.type}
     found["images"] = len(bpy.data.images)
-    found["again"], found["images again"] = in_the_event_loop(cancel=False), len(bpy.data.images)
-    found["cancelled again"] = in_the_event_loop(cancel=True)
-    scene.selfcorrect.denoiser = "nonsense"
+    found["again"], found["images again"] = in_the_event_loop(), len(bpy.data.images)
+    found["cancelled again"] = in_the_event_loop("button")
+    found["escaped"] = in_the_event_loop("escape")
+    scene.selfcorrect.denoiser, scene.selfcorrect.other = "other", "nonsense"
+    found["other panel"], found["failing in a window"] = drawn(), in_the_event_loop()
     found["failing"], found["settings after failing"] = attempt(), settings()
-    scene.selfcorrect.denoiser = ""
+    scene.selfcorrect.denoiser, scene.selfcorrect.prefilter = "oidn", "oidn:fast"
+    scene.selfcorrect.preset, scene.selfcorrect.aovs, scene.selfcorrect.page = "fast", True, True
+    found["oidn panel"] = drawn()
+    found["planned"] = sys.modules[MODULE].work.plan(scene, COMMAND, range(1, 3), Path(FOLDER)).steps[1].command
+    scene.selfcorrect.denoiser, scene.selfcorrect.aovs = "best", False
     found["cancelled"] = cancelled()
     scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
     bpy.app.binary_path = PROGRAM  # from here on as in Blender itself, which renders with another of its kind
     found["animation"], found["source"] = attempt(animation=True), image.source
+    found["page panel"] = drawn()
     scene.render.engine = "BLENDER_WORKBENCH"
     found["engine"] = attempt()
     bpy.ops.preferences.addon_disable(module=MODULE)

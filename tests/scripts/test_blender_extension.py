@@ -16,7 +16,7 @@ from helpers.render_scripts import BLENDER, BLENDER_TAKEN, done
 from selfcorrect import exr
 
 HERE = Path(__file__).resolve().parent
-INSTALL = "pip install '.[oidn]' in the folder of selfcorrect"
+INSTALL = "sh scripts/install in the folder of selfcorrect"
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,13 @@ def test_the_zip_holds_what_it_needs_and_the_same_bytes_again(archive: Path, tmp
     assert build_extension.build(tmp_path).read_bytes() == archive.read_bytes()
     names = {"__init__.py", "job.py", "work.py", "blender_manifest.toml", "render_blender.py", "halves.py", "LICENSE"}
     assert set(zipfile.ZipFile(archive).namelist()) == names
+
+
+def test_wheels_come_along(tmp_path: Path) -> None:
+    (tmp_path / "selfcorrect-0.1.0-py3-none-any.whl").write_bytes(b"wheel")
+    (tmp_path / "other-1.0-py3-none-any.whl").write_bytes(b"not ours")
+    names = zipfile.ZipFile(build_extension.build(tmp_path / "out", tmp_path)).namelist()
+    assert [name for name in names if name.startswith("wheels/")] == ["wheels/selfcorrect-0.1.0-py3-none-any.whl"]
 
 
 @pytest.mark.blender
@@ -73,7 +80,7 @@ def found(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
         capture_output=True,
         text=True,
         check=False,
-        timeout=600,
+        timeout=1800,
         env=environment,
     )
     assert result.returncode == 0, result.stdout + result.stderr
@@ -102,7 +109,20 @@ def test_without_selfcorrect_it_says_how_to_install_it(found: dict[str, Any]) ->
     assert f"selfcorrect is not installed; run in a terminal: {INSTALL}" in found["missing"]
     assert {"selfcorrect is not installed", f"In a terminal: {INSTALL}", "Preferences"} <= set(found["missing panel"])
     assert "Frame" not in found["missing panel"]
-    assert {"samples", "output", "denoiser", "preset", "aovs", "Frame", "Animation"} <= set(found["panel"])
+    assert {"samples", "output", "denoiser", "preset", "aovs", "page", "Frame", "Animation"} <= set(found["panel"])
+    assert {"prefilter", "other", "Open Report"}.isdisjoint(found["panel"])
+
+
+@pytest.mark.blender
+def test_what_the_panel_offers_reaches_the_command(found: dict[str, Any]) -> None:
+    assert "prefilter" in found["oidn panel"]
+    assert "other" in found["other panel"]
+    planned, out = found["planned"], found["folder"] / "out"
+    flags = ["--denoiser", "oidn:fast", "--preset", "fast", "--aovs", "auto"]
+    assert planned[1] == "sequence"
+    assert planned[-8:] == [*flags, "--report", str(out / "room.0001.html")]
+    assert (out / "room.0001.html").is_file()  # of the animation
+    assert "Open Report" in found["page panel"]
 
 
 @pytest.mark.blender
@@ -127,16 +147,31 @@ def test_the_button_leaves_blender_to_the_user_meanwhile(found: dict[str, Any]) 
     assert again["reports"] == [f"room.0001.exr in {found['folder'] / 'out'}"]
     assert cancelled["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["CANCELLED"]]
     assert cancelled["reports"] == ["cancelled"]
+    assert cancelled["popups"] == again["popups"] == []
+    assert again["status"][0].startswith("selfcorrect: 0%")
+    assert any("Correcting   Esc: cancel" in text for text in again["status"][:-1])
+    assert again["status"][-1] is cancelled["status"][-1] is None  # Blender's own text again
     assert again["timers"] == cancelled["timers"] == 0
     assert "selfcorrect.cancel" in again["drawn"]
     assert found["images again"] == found["images"]
 
 
 @pytest.mark.blender
+def test_escape_cancels_and_a_failure_pops_up(found: dict[str, Any]) -> None:
+    escaped, failing = found["escaped"], found["failing in a window"]
+    assert escaped["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["RUNNING_MODAL"], ["CANCELLED"]]
+    assert (escaped["reports"], escaped["popups"], escaped["status"][-1]) == (["cancelled"], [], None)
+    ((title, icon, *lines),) = failing["popups"]
+    assert (title, icon) == ("selfcorrect", "ERROR")
+    assert "Correcting failed: expected a denoiser" in lines[0]
+    assert all(len(line) <= 90 for line in lines)
+
+
+@pytest.mark.blender
 def test_an_animation(found: dict[str, Any]) -> None:
     assert found["animation"] == ["FINISHED"]
     assert found["source"] == "SEQUENCE"
-    names = {path.name for path in (found["folder"] / "out").glob("room*")}
+    names = {path.name for path in (found["folder"] / "out").glob("room*.exr")}
     assert names == {f"room{half}.{frame}.exr" for half in ("", "_a", "_b") for frame in ("0001", "0003")}
 
 

@@ -2,13 +2,14 @@
 
 import shutil
 import tempfile
+import textwrap
 import time
 from pathlib import Path
 
 import bpy
 
 from . import work
-from .job import Job
+from .job import CANCELLED, Job
 
 INTERVAL = 0.2  # seconds between two looks at the programs
 
@@ -18,6 +19,7 @@ class State:
 
     job: Job | None = None
     message: str = ""
+    page: str = ""  # the report of the last job
 
 
 class SelfcorrectPreferences(bpy.types.AddonPreferences):
@@ -35,7 +37,7 @@ class SelfcorrectPreferences(bpy.types.AddonPreferences):
         self.layout.prop(self, "command")
         found = work.find_command(self)
         self.layout.label(
-            text=found or f"Not found. In a terminal: {work.INSTALL}", icon="CHECKMARK" if found else "ERROR"
+            text=found or f"Not found. In a terminal: {work.how_to_install()}", icon="CHECKMARK" if found else "ERROR"
         )
 
 
@@ -48,13 +50,54 @@ class SelfcorrectSettings(bpy.types.PropertyGroup):
     output: bpy.props.StringProperty(
         name="Folder", default="//selfcorrect", subtype="DIR_PATH", description="For the halves and the result"
     )
-    denoiser: bpy.props.StringProperty(
-        name="Denoiser", description="oidn, joint-bilateral, …; empty takes the best that is installed"
+    denoiser: bpy.props.EnumProperty(
+        name="Denoiser",
+        items=[
+            ("best", "Best Installed", "OpenImageDenoise where it is installed, else the network of selfcorrect"),
+            ("oidn", "OpenImageDenoise", "Intel's, as in Blender"),
+            ("onnx", "selfcorrect", "The network that selfcorrect brings"),
+            ("nfor", "NFOR", "First-order regression on albedo and normal; slow, without a neural network"),
+            ("joint-bilateral", "Joint Bilateral", "A simple filter, guided by albedo and normal"),
+            ("other", "Other", "What is written below"),
+        ],
     )
-    preset: bpy.props.StringProperty(name="Preset", description="balanced, paper, …; empty takes the default")
+    prefilter: bpy.props.EnumProperty(
+        name="Prefilter",
+        description="What OpenImageDenoise does about noise in albedo and normal",
+        items=[
+            ("oidn", "Accurate", "Denoise albedo and normal first"),
+            ("oidn:fast", "Fast", "Take them for free of noise, as they are"),
+            ("oidn:none", "None", "Take them for noisy, as they are"),
+        ],
+    )
+    other: bpy.props.StringProperty(
+        name="Name", description="As after --denoiser: onnx:MODEL.onnx, command:..., file.py:Class"
+    )
+    preset: bpy.props.EnumProperty(
+        name="Preset",
+        items=[
+            ("balanced", "Balanced", "The default"),
+            ("fast", "Fast", "An eighth of the training"),
+            ("best", "Best", "More training"),
+            ("paper", "Paper", "The published method as it is, without the guard"),
+        ],
+    )
     aovs: bpy.props.BoolProperty(
         name="Light Passes", description="Correct light passes and light groups too, so that they sum to the picture"
     )
+    page: bpy.props.BoolProperty(
+        name="Report", description="Write a page to look at beside the result: a slider, maps, and what was gained"
+    )
+
+
+def popup(message):
+    """What a pop-up draws: a long message in lines that fit."""
+
+    def draw(menu, context):
+        for line in textwrap.wrap(message, 90):
+            menu.layout.label(text=line)
+
+    return draw
 
 
 def preferences(context):
@@ -92,45 +135,64 @@ class SELFCORRECT_OT_render(bpy.types.Operator):
         except work.WorkError as error:
             self._clean()
             return self._failed(str(error))
+        self._status(context)
         self._timer = context.window_manager.event_timer_add(INTERVAL, window=context.window)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
+        if event.type == "ESC" and event.value == "PRESS" and State.job is not None:
+            State.job.cancel()
+            return {"RUNNING_MODAL"}  # nobody else is to be cancelled by this key
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         running = State.job is not None and State.job.poll()
+        self._status(context)
+        if running:
+            return {"PASS_THROUGH"}
+        context.window_manager.event_timer_remove(self._timer)
+        context.workspace.status_text_set(None)
+        try:
+            result = self._end(context)
+        except work.WorkError as error:
+            result = self._failed(str(error))
+        finally:
+            self._clean()
+        if (
+            result == {"CANCELLED"} and State.message != CANCELLED
+        ):  # what a modal operator reports at its end is only written to the status bar
+            context.window_manager.popup_menu(popup(State.message), title="selfcorrect", icon="ERROR")
+        return result
+
+    def _status(self, context):
+        """Progress in the status bar and in the panel."""
+        if State.job is not None:
+            context.workspace.status_text_set(f"selfcorrect: {State.job.progress:.0%} {State.job.label}   Esc: cancel")
         for window in context.window_manager.windows:
             for area in window.screen.areas:
                 if area.type == "PROPERTIES":
                     area.tag_redraw()
-        if running:
-            return {"PASS_THROUGH"}
-        context.window_manager.event_timer_remove(self._timer)
-        try:
-            return self._end(context)
-        except work.WorkError as error:
-            return self._failed(str(error))
-        finally:
-            self._clean()
 
     def cancel(self, context):
         """Blender itself ends the operator, for another file or to quit."""
+        if context.workspace is not None:  # there is none left where Blender quits
+            context.workspace.status_text_set(None)
         self._clean()
 
     def _begin(self, context):
         scene = context.scene
         shot = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         frames = shot if self.animation else range(scene.frame_current, scene.frame_current + 1)
-        State.message = ""
+        State.message = State.page = ""
         self._scratch = Path(tempfile.mkdtemp(prefix="selfcorrect-"))
         State.job = work.plan(scene, work.find_command(preferences(context)), frames, self._scratch)
 
     def _end(self, context):
         job = State.job
         if job is None or job.error is not None:
-            return self._failed("cancelled" if job is None else job.error)
+            return self._failed(CANCELLED if job is None else job.error)
         work.show(job.outputs, [window.screen for window in context.window_manager.windows])
+        State.page = str(job.page) if job.page is not None and job.page.is_file() else ""
         State.message = f"{job.outputs[0].name} in {job.outputs[0].parent}"
         self.report({"INFO"}, State.message)
         return {"FINISHED"}
@@ -186,17 +248,20 @@ class SELFCORRECT_PT_panel(bpy.types.Panel):
         if work.find_command(preferences(context)) is None:
             box = layout.box()
             box.label(text="selfcorrect is not installed", icon="ERROR")
-            box.label(text=f"In a terminal: {work.INSTALL}")
+            box.label(text=f"In a terminal: {work.how_to_install()}")
             box.label(text="Or name the program in the preferences:")
             box.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = __package__
             return
-        for name in ("samples", "output", "denoiser", "preset", "aovs"):
+        beside = {"oidn": ["prefilter"], "other": ["other"]}.get(settings.denoiser, [])
+        for name in ("samples", "output", "denoiser", *beside, "preset", "aovs", "page"):
             layout.prop(settings, name)
         row = layout.row(align=True)
         row.operator("selfcorrect.render", text="Frame", icon="RENDER_STILL").animation = False
         row.operator("selfcorrect.render", text="Animation", icon="RENDER_ANIMATION").animation = True
         if State.message:
             layout.label(text=State.message)
+        if State.page:
+            layout.operator("wm.path_open", text="Open Report", icon="URL").filepath = State.page
 
 
 CLASSES = (

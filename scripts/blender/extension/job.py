@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 _STEPS = re.compile(r"(?:Sample|step) (\d+)(?:/| of )(\d+)")
+CANCELLED = "cancelled"
 _KEPT = 40  # lines of output, for the message of a failure
 
 
@@ -37,6 +38,7 @@ class Job:
     Attributes:
         steps: the programs.
         outputs: what they make, for whoever waits.
+        page: the report that they write beside, or None.
         progress: from 0 to 1.
         label: what is being done.
         error: why it ended early, or None.
@@ -44,6 +46,7 @@ class Job:
 
     steps: list[Step]
     outputs: list[Path]
+    page: Path | None = None
     progress: float = 0.0
     label: str = ""
     error: str | None = None
@@ -66,7 +69,7 @@ class Job:
             self._start()
         return self.error is None
 
-    def cancel(self, reason: str = "cancelled") -> None:
+    def cancel(self, reason: str = CANCELLED) -> None:
         """End the program that runs; the rest do not start."""
         self.error = self.error or reason
         if self._process is not None and self._process.poll() is None:

@@ -10,7 +10,8 @@ import bpy
 
 from .job import Job, Step
 
-INSTALL = "pip install '.[oidn]' in the folder of selfcorrect"
+WHEELS = Path(__file__).parent / "wheels"  # where build_extension.py was given some
+LINKS = Path.home() / ".local" / "bin"  # where scripts/install puts the command; a desktop's PATH may lack it
 RENDER_PART = 0.6  # of the time; the rest is correcting
 
 
@@ -20,7 +21,17 @@ class WorkError(Exception):
 
 def find_command(preferences: bpy.types.AddonPreferences) -> str | None:
     """Path of the `selfcorrect` command: the one of the preferences, else the one on PATH."""
-    return shutil.which(bpy.path.abspath(preferences.command) if preferences.command else "selfcorrect")
+    if preferences.command:
+        return shutil.which(bpy.path.abspath(preferences.command))
+    return shutil.which("selfcorrect") or shutil.which("selfcorrect", path=LINKS)
+
+
+def how_to_install(wheels: Path = WHEELS) -> str:
+    """What to run in a terminal: pip takes that of the wheels here which fits its Python and machine."""
+    if not any(wheels.glob("*.whl")):
+        return "sh scripts/install in the folder of selfcorrect"
+    first = f'pip install --no-index --no-deps --find-links "{wheels}" selfcorrect'
+    return f'{first} && pip install "selfcorrect[oidn,flow]"'
 
 
 def output_folder(scene: bpy.types.Scene) -> Path:
@@ -46,7 +57,7 @@ def plan(scene: bpy.types.Scene, command: str | None, frames: range, scratch: Pa
         WorkError: there is no command, the scene is not rendered with Cycles, or it cannot be saved.
     """
     if command is None:
-        raise WorkError(f"selfcorrect is not installed; run in a terminal: {INSTALL}")
+        raise WorkError(f"selfcorrect is not installed; run in a terminal: {how_to_install()}")
     if scene.render.engine != "CYCLES":
         raise WorkError("selfcorrect needs a scene rendered with Cycles")
     own = scene.selfcorrect
@@ -67,9 +78,12 @@ def plan(scene: bpy.types.Scene, command: str | None, frames: range, scratch: Pa
         correct += ["-o", str(outputs[0])]
     else:
         correct = [command, "sequence", a, b, "-o", corrected, f"--frames={shot}"]
-    correct += ["--denoiser", own.denoiser] if own.denoiser else []
-    correct += ["--preset", own.preset] if own.preset else []
+    denoiser = {"best": "", "oidn": own.prefilter, "other": own.other}.get(own.denoiser, own.denoiser)
+    correct += ["--denoiser", denoiser] if denoiser else []
+    correct += ["--preset", own.preset]
     correct += ["--aovs", "auto"] if own.aovs else []
+    page = outputs[0].with_suffix(".html") if own.page else None
+    correct += ["--report", str(page)] if page is not None else []
     render = [*_blender(copy), "--scene-name", scene.name, *flags]
     return Job(
         [
@@ -77,6 +91,7 @@ def plan(scene: bpy.types.Scene, command: str | None, frames: range, scratch: Pa
             Step("Correcting", correct, 1 - RENDER_PART, len(frames), ": written after"),
         ],
         outputs,
+        page,
     )
 
 

@@ -15,7 +15,7 @@ __all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "has_fast_bf
 
 def has_fast_bf16(device: torch.device) -> bool:
     """Whether torch's own convolutions in bfloat16 are fast there; else they are emulated."""
-    return gpu.has_fast_bf16(device) or (device.type == "cpu" and best_instruction_set("bf16") == "amx")
+    return gpu.has_fast_bf16(device) or (device.type == "cpu" and "amx" in cpu.instruction_sets())
 
 
 def convolutions(

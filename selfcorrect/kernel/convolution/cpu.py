@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from selfcorrect.errors import FrameError
-from selfcorrect.kernel import _cpu
 from selfcorrect.kernel.backend import instruction_set
+from selfcorrect.kernel.compiled import functions as _cpu
+from selfcorrect.kernel.compiled import installed
 
 __all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "instruction_sets", "peak"]
 
@@ -17,7 +18,7 @@ LARGEST_WIDTH = 16  # channels of a layer: a vector of the widest processors
 
 def instruction_sets() -> list[str]:
     """Names of the compiled variants that this processor can run, slowest first; ``amx`` works in bfloat16."""
-    return list(_cpu.convolution_instruction_sets())
+    return list(_cpu.convolution_instruction_sets()) if installed() else []
 
 
 def best_instruction_set(precision: str) -> str:

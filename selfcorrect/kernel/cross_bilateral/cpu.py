@@ -1,4 +1,4 @@
-"""The compiled kernel as differentiable torch functions."""
+"""The compiled kernel as differentiable torch _cpu."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from selfcorrect.buffers import TERMS
-from selfcorrect.kernel import _cpu
 from selfcorrect.kernel.backend import instruction_set
+from selfcorrect.kernel.compiled import functions as _cpu
 from selfcorrect.kernel.cross_bilateral.window import Window
 from selfcorrect.kernel.guides import Guides
 

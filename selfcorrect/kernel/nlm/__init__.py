@@ -11,7 +11,7 @@ from torch import Tensor
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.kernel.backend import choose
 from selfcorrect.kernel.nlm import cpu, reference
-from selfcorrect.kernel.nlm.cpu import Strip
+from selfcorrect.kernel.nlm.strip import Strip
 
 __all__ = ["Strip", "non_local_means", "strips"]
 
@@ -34,7 +34,7 @@ def non_local_means(
     Args:
         values: what is averaged.
         guide, variance, radius, patch_radius, k, threads: see :func:`strips`.
-        backend: as for :func:`selfcorrect.kernel.backend.choose`; the reference holds every patch of every window.
+        backend: as for :func:`selfcorrect.kernel.backend.choose`; the reference holds the windows of some rows.
     """
     _validate(guide, variance, radius, patch_radius, k)
     if values.shape[:2] != guide.shape[:2] or not 1 <= values.shape[2] <= 4:
@@ -51,7 +51,7 @@ def non_local_means(
 def strips(
     guide: Tensor, variance: Tensor, *, radius: int, patch_radius: int, k: float, threads: int = 1
 ) -> Iterator[Strip]:
-    """Weights exp(−max(0, d²)) of the (2·radius+1)² pixels around each pixel, strip by strip, compiled.
+    """Weights exp(−max(0, d²)) of the (2·radius+1)² pixels around each pixel, strip by strip.
 
     d² is the mean over channels and the patch of ((u_p − u_q)² − (v_p + min(v_p, v_q))) / (1e-10 + k² (v_p + v_q)) with
     u the guide and v its variance: what noise alone explains does not count. The border is mirrored without repeating
@@ -70,7 +70,10 @@ def strips(
         SettingsError: a number is out of range.
     """
     _validate(guide, variance, radius, patch_radius, k)
-    return cpu.strips(guide.cpu(), variance.cpu(), radius=radius, patch_radius=patch_radius, k=k, threads=threads)
+    guide, variance = guide.cpu(), variance.cpu()
+    if choose(None, [guide, variance], dtypes=_DTYPES) == "reference":
+        return reference.strips(guide, variance, radius=radius, patch_radius=patch_radius, k=k)
+    return cpu.strips(guide, variance, radius=radius, patch_radius=patch_radius, k=k, threads=threads)
 
 
 def _validate(guide: Tensor, variance: Tensor, radius: int, patch_radius: int, k: float) -> None:

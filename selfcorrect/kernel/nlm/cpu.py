@@ -5,28 +5,20 @@ regression) works strip by strip.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from selfcorrect.image.exposure import LARGEST
 from selfcorrect.image.windows import reflect
-from selfcorrect.kernel import _cpu
 from selfcorrect.kernel.backend import instruction_set
+from selfcorrect.kernel.compiled import functions as _cpu
+from selfcorrect.kernel.nlm.strip import Strip
 
-__all__ = ["Strip", "non_local_means", "strips"]
+__all__ = ["non_local_means", "strips"]
 
 _LANES = 16
 _STRIP = 1 << 24  # weights held at a time: 64 MB
-
-
-@dataclass(frozen=True)
-class Strip:
-    """Weights of the windows of some rows: (taps, rows, columns), the columns rounded up to a vector."""
-
-    first_row: int
-    weights: Tensor
 
 
 def strips(

@@ -49,7 +49,7 @@ def regress(
         bandwidth: > 0.
         stride: models are solved at every stride-th pixel of every stride-th row, 1 … 16 and at most the window.
         threads: of the compiled form.
-        backend: as for :func:`selfcorrect.kernel.backend.choose`; the reference holds every window at once.
+        backend: as for :func:`selfcorrect.kernel.backend.choose`; the reference holds the windows of some rows.
 
     Returns:
         (H, W, 3), float32 from the compiled form.
@@ -86,7 +86,7 @@ def regress_non_local(
     ridge: float,
     threads: int = 1,
 ) -> Tensor:
-    """As :func:`regress` with a model at every pixel, but with given weights, those of non-local means; compiled.
+    """As :func:`regress` with a model at every pixel, but with given weights, those of non-local means.
 
     Args:
         features: as for :func:`regress`.
@@ -96,8 +96,11 @@ def regress_non_local(
         ridge, threads: as for :func:`regress`.
     """
     _check_shapes(features, targets)
-    features, there = [feature.cpu() for feature in features], targets.device
-    fitted = cpu.regress_non_local(features, targets.cpu(), weights, radius=radius, ridge=ridge, threads=threads)
+    features, targets, there = [feature.cpu() for feature in features], targets.cpu(), targets.device
+    if choose(None, [*features, targets], dtypes=_DTYPES) == "reference":
+        fitted = reference.regress_non_local(features, targets, weights, radius=radius, ridge=ridge)
+    else:
+        fitted = cpu.regress_non_local(features, targets, weights, radius=radius, ridge=ridge, threads=threads)
     return fitted.to(there)
 
 

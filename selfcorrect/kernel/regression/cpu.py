@@ -9,8 +9,8 @@ from torch import Tensor
 
 from selfcorrect.image.exposure import LARGEST
 from selfcorrect.image.windows import reflect
-from selfcorrect.kernel import _cpu
 from selfcorrect.kernel.backend import instruction_set
+from selfcorrect.kernel.compiled import functions as _cpu
 from selfcorrect.kernel.nlm import Strip
 
 __all__ = ["regress", "regress_non_local"]
