@@ -27,7 +27,7 @@ import denoisers
 from selfcorrect import Frame, Settings, correct, exr, metrics
 from selfcorrect.history import Histories
 
-ROLES = ("color", "albedo", "normal", "visibility", "depth")
+ROLES = ("color", "albedo", "normal", "visibility", "depth", "motion")
 
 
 def load(folder: Path, number: int, denoiser: str, threads: int) -> tuple[Frame, list[np.ndarray]]:
@@ -38,7 +38,7 @@ def load(folder: Path, number: int, denoiser: str, threads: int) -> tuple[Frame,
         return folder / f"{shot}_{kind}.{number:04d}.exr"
 
     plugin = denoisers.create(denoiser, threads=threads)
-    a, b, *both = (exr.load_half(file(kind)).buffers for kind in ("a", "b", "ref_a", "ref_b"))
+    a, b, *both = (exr.load_half(file(kind), shot=True).buffers for kind in ("a", "b", "ref_a", "ref_b"))
     frame = Frame(**{role: (a[role], b[role]) for role in ROLES if role in a}).denoise(plugin, keep_aids=True)
     references = [np.asarray(buffers["color"]) for buffers in both]
     if file("ref_smooth").exists():
