@@ -59,7 +59,7 @@ _RENDERMAN = tuple(
 CONVENTIONS = (
     Convention(
         "Vector", (_XYZW,), ((0, 1), (1, -1)), ((2, -1), (3, 1)), True, "Blender Cycles",
-        "measured: albedo reprojected by it fits (tests/render); the manual names no signs; motion blur has to be off",
+        "measured: albedo reprojected by it fits (tests/scripts); the manual names no signs; motion blur has to be off",
     ),
     Convention(
         "", _RENDERMAN, ((0, 1), (1, 1)), ((2, 1), (3, 1)), True, "RenderMan",
