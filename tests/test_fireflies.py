@@ -97,7 +97,7 @@ def test_noise_explains_itself() -> None:
 
 @pytest.mark.parametrize(("energy", "goes"), [(70.0, False), (20.0, True)])
 def test_light_that_the_other_half_has_met_beside_it_stays(energy: float, goes: bool) -> None:
-    """A caustic of few paths: the denoiser has taken one half's for noise, the noisy pixel tells. Lesser ones do not."""
+    """A caustic of few paths: the denoiser has taken one half's for noise, noisy pixels tell; a lesser one does not."""
     clean, pair = truth(), halves(truth())
     noisy = [half.clone() for half in pair]
     pair[0] = pair[0] + spot(SIZE, 40, 50)
