@@ -7,7 +7,7 @@ A new buffer is a row in :data:`BUFFERS`, its name in :class:`selfcorrect.frame.
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["BUFFERS", "COLOR", "DENOISED", "FEATURES", "INPUTS", "TERMS", "Buffer"]
+__all__ = ["BUFFERS", "COLOR", "DENOISED", "FEATURES", "INPUTS", "MOTION", "TERMS", "Buffer"]
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,8 @@ class Buffer:
         name: the field of a frame that holds the pair of both halves.
         symbol: in the papers' equations.
         channels: of a pixel.
-        kind: linear radiance ≥ 0, which takes part in exposure; or a feature, a G-buffer as the renderer wrote it.
+        kind: linear radiance ≥ 0, which takes part in exposure; a feature, a G-buffer as the renderer wrote it; or
+            motion, where neighbouring frames of a shot show a pixel's surface, in pixels, NaN where it is unknown.
         place: among the network's inputs, ascending; None where the network does not see it.
         scale: whether Eq. 10 has a scale β for it, three channels.
         distance: how Eq. 11 measures it, d² or ln(1 + d²); None where it does not.
@@ -28,7 +29,7 @@ class Buffer:
     name: str
     symbol: str
     channels: int
-    kind: Literal["radiance", "feature"]
+    kind: Literal["radiance", "feature", "motion"]
     place: int | None
     scale: bool
     distance: Literal["squared", "logarithmic"] | None
@@ -37,6 +38,8 @@ class Buffer:
 
 COLOR = Buffer("color", "y", 3, "radiance", 0, scale=False, distance="logarithmic", first_bandwidth=3.0)
 DENOISED = Buffer("denoised", "z", 3, "radiance", 4, scale=True, distance="logarithmic", first_bandwidth=1.0)
+MOTION = Buffer("motion", "m", 4, "motion", None, scale=False, distance=None)
+"""To the frame before, x to the right and y downwards, then to the frame after: where a pixel's surface is there."""
 
 BUFFERS = (
     COLOR,
@@ -45,6 +48,7 @@ BUFFERS = (
     Buffer("normal", "n", 3, "feature", 3, scale=True, distance="squared", first_bandwidth=0.4),
     Buffer("depth", "d", 1, "feature", None, scale=False, distance=None),
     Buffer("visibility", "v", 1, "feature", 2, scale=False, distance="squared", first_bandwidth=0.2),
+    MOTION,
 )
 """Every buffer, in the order of the network's outputs: the scales β, then the bandwidths γ."""
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect import exr
-from selfcorrect.buffers import FEATURES
+from selfcorrect.buffers import FEATURES, MOTION
 from selfcorrect.correct import COLOR_OUTPUT
 from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsError
 from selfcorrect.exr.aovs import Plan, plan
@@ -119,8 +119,8 @@ class Loaded:
     origin: Origin
 
 
-def load(sources: Sources) -> Loaded:
-    """Read both halves and, where they are given, their denoised images.
+def load(sources: Sources, *, shot: bool = False) -> Loaded:
+    """Read both halves and, where they are given, their denoised images; for a ``shot`` also motion.
 
     Raises:
         FileError: a file cannot be read, or the same file was given twice.
@@ -130,7 +130,8 @@ def load(sources: Sources) -> Loaded:
     _check_distinct(sources)
     stamps = _stamp(sources.a), _stamp(sources.b)
     check_alike(sources.paths)
-    half_a, half_b = _half(sources.a, sources.mapping, passes=True), _half(sources.b, sources.mapping)
+    half_a = _half(sources.a, sources.mapping, passes=True, shot=shot)
+    half_b = _half(sources.b, sources.mapping, shot=shot and MOTION.name not in half_a.buffers)
     height, width = half_a.buffers["color"].shape[:2]
     if half_b.buffers["color"].shape[:2] != (height, width):
         other = half_b.buffers["color"].shape
@@ -152,6 +153,10 @@ def load(sources: Sources) -> Loaded:
         if in_a:
             pairs[role] = (half_a.buffers[role], half_b.buffers[role])
             taken[role] = half_a.taken[role]
+    if moving := next((half for half in (half_a, half_b) if MOTION.name in half.buffers), None):
+        # of surfaces, not of samples: both halves show the same, and one tells it
+        pairs[MOTION.name] = (moving.buffers[MOTION.name],) * 2
+        taken[MOTION.name] = moving.taken[MOTION.name]
     denoised = _denoised(sources, half_a, half_b)
     if denoised:
         pairs["denoised"] = denoised
@@ -187,9 +192,9 @@ class _Half(NamedTuple):
     lost: tuple[str, ...]  # attributes that cannot be written back
 
 
-def _half(path: str, mapping: Mapping[str, str] | None = None, *, passes: bool = False) -> _Half:
-    """A half; ``passes``: its other channels and its attributes are to be written again."""
-    half = exr.load_half(path, mapping=mapping)
+def _half(path: str, mapping: Mapping[str, str] | None = None, *, passes: bool = False, shot: bool = False) -> _Half:
+    """A half; ``passes``: its other channels and its attributes are to be written again; ``shot``: with motion."""
+    half = exr.load_half(path, mapping=mapping, shot=shot)
     lost = exr.check_source(half.file) if passes else []
     used = {role: torch.from_numpy(buffer) for role, buffer in half.buffers.items() if role != "alpha"}
     window = half.file.parts[half.file.place(half.taken["color"][0])[0]].data_window

@@ -1,7 +1,7 @@
 """Fireflies that the denoiser has left: two independent halves show them, where no single image can.
 
 A path of great energy that one half has met and the other has not stays in that half's denoised image as a bright spot,
-and in that of both. Where one denoised half is far brighter than the other, the darker one is taken, if four things say
+and in that of both. Where one denoised half is far brighter than the other, the darker one is taken, if five things say
 that chance has met a firefly and not the other half missed a light. With m the mean of a half's channels, of a frame
 whose mean is near 1, and ε = 0.1:
 
@@ -14,6 +14,9 @@ whose mean is near 1, and ε = 0.1:
 3. Somewhere within four pixels the spot outshines what both halves agree on nearly everywhere: the 0.99 quantile of
    min(m^a, m^b). What is as bright as the frame's lights and their reflections may be one.
 4. The darker half is itself no brighter than that: a lamp or a star that both have met stays, however different.
+5. Nowhere within four pixels is there a pixel of the spot around which the other half's noisy pixels, again within
+   four, reach half of the brightest of the spot's own half. In a caustic both meet paths of the same great energy, one
+   here and one beside: however few, they are light.
 
 What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
 given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
@@ -37,7 +40,7 @@ _AROUND = 2  # tiles on each side, of which the median is taken
 _GROWN = 2  # pixels
 _WITNESS = 5  # side of the window of noisy pixels
 _SPOT = 4  # pixels from a spot's brightest part
-_REACH = 2 * _GROWN + _SPOT + _WITNESS // 2
+_REACH = 2 * _GROWN + 3 * _SPOT
 _MOST_PIXELS = 2**20  # that tell what is bright, in rows spread evenly over the frame
 _STRICTER = 2.0  # each time too much would go, the threshold is multiplied by this
 _TRIES = 5
@@ -55,6 +58,7 @@ class Rule(NamedTuple):
         quantile: of δ in a tile, that is its spread.
         darkest: ε.
         doubts: standard errors of the other half's noisy pixels.
+        alike: share of a firefly's noisy radiance that the other half's pixels nearby must not reach.
         usual: share of the pixels, 0 … 1, that are darker than what may be a light.
         most: share of the image's light, 0 … 1, that may go.
     """
@@ -64,6 +68,7 @@ class Rule(NamedTuple):
     quantile: float = 0.75
     darkest: float = 0.1
     doubts: float = 2.0
+    alike: float = 0.5
     usual: float = 0.99
     most: float = 0.01
 
@@ -169,6 +174,7 @@ class _Search:
         threshold = self.stricter * (self._rule.spreads * spread).clamp(min=math.log(self._rule.least))
         found = (self._disagreement(wide) > threshold) & (torch.minimum(a, b) <= self._usual)
         found &= self._contradicted(a, b, wide)
+        found &= _largest_around(found & self._met_by_both(a, b, wide), _SPOT) == 0
         spot = found & (torch.maximum(a, b) > self._usual)
         found &= _largest_around(spot, _SPOT) > 0
         return _mean_around(_largest_around(found, _GROWN), _GROWN)[inner]
@@ -183,6 +189,11 @@ class _Search:
         contradicted: Tensor = torch.where(a > b, doubts[0], doubts[1])
         return contradicted
 
+    def _met_by_both(self, a: Tensor, b: Tensor, rows: slice) -> Tensor:
+        """Whether the darker half's noisy pixels nearby are about as bright as the brighter one's, (rows, W)."""
+        in_a, in_b = (_largest_around(noisy, _SPOT) for noisy in self._means(self._color, rows))
+        return torch.where(a > b, in_b > self._rule.alike * in_a, in_a > self._rule.alike * in_b)
+
     def excess(self, image: Radiance, rows: slice) -> Tensor:
         """What to take off rows of an image, (rows, W, 3) ≥ 0."""
         a, b = (half[rows].double() for half in self._denoised)
@@ -190,8 +201,8 @@ class _Search:
         return self.weight(rows)[..., None] * (image[rows].double() - darker).clamp(min=0)
 
 
-def _largest_around(marked: Tensor, reach: int) -> Tensor:
-    return F.max_pool2d(marked.double()[None], 2 * reach + 1, 1, reach)[0]
+def _largest_around(values: Tensor, reach: int) -> Tensor:
+    return F.max_pool2d(values.double()[None], 2 * reach + 1, 1, reach)[0]
 
 
 def _mean_around(values: Tensor, reach: int) -> Tensor:

@@ -29,6 +29,7 @@ class Half(NamedTuple):
     normal: Tensor | None = None
     visibility: Tensor | None = None
     depth: Tensor | None = None
+    motion: Tensor | None = None
 
     @property
     def features(self) -> dict[str, Tensor]:
@@ -78,6 +79,8 @@ class Frame:
         depth: 1 channel.
         denoised_full: the denoised mean of both halves, a single array.
         more: further images of the frame that the guard may blend in, finite and ≥ 0.
+        motion: 4 channels (:data:`selfcorrect.buffers.MOTION`), for the history of a shot's frames; what is NaN or
+            infinite is unknown and stays so.
 
     Attributes:
         aids: what the denoiser was given beside the colours of both halves together, of half a and of half b, where
@@ -96,6 +99,7 @@ class Frame:
     depth: Pair | None = None
     denoised_full: Any = None
     more: tuple[Candidate, ...] = ()
+    motion: Pair | None = None
     repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
     constant: list[str] = field(init=False, default_factory=list)
     aids: "Aids | None" = field(init=False, default=None)
@@ -289,7 +293,7 @@ def checked(
     """
     tensors, counts = [], Repairs(0, 0)
     for what, array in zip(names, arrays, strict=True):
-        tensor = as_tensor(array, what, buffer.channels, half=buffer.kind == "feature")
+        tensor = as_tensor(array, what, buffer.channels, half=buffer.kind != "radiance")
         if size is not None and tensor.shape[:2] != size:
             raise FrameError(
                 f"expected {what} of {size[1]}x{size[0]} pixels like the colour of half a, "
@@ -298,6 +302,10 @@ def checked(
         size = (tensor.shape[0], tensor.shape[1])
         if buffer.kind == "radiance":
             check_finite(tensor, what)
+        if buffer.kind == "motion":  # what would be filled in is no motion of that surface
+            infinite = tensor.isinf()
+            tensors.append(torch.where(infinite, torch.nan, tensor) if bool(infinite.any()) else tensor)
+            continue
         tensor, repairs = repair(tensor, radiance=buffer.kind == "radiance")
         tensors.append(tensor)
         counts = Repairs(*(x + y for x, y in zip(counts, repairs, strict=True)))

@@ -3,7 +3,8 @@
     .venv/bin/python scripts/bench/shot.py ../shared/shot [--preset balanced] [--variants cold warm warm:steps=50 key]
 
 The folder holds ``NAME_a.####.exr``, ``NAME_b``, ``NAME_ref_a``, ``NAME_ref_b`` and perhaps ``NAME_ref_smooth``, else
-the denoised mean of the references; ``scripts/render/ghosts.py`` makes such a folder.
+the denoised mean of the references; ``scripts/render/ghosts.py`` makes such a folder. Frames without references are
+neighbours only. ``--flow`` leaves motion passes out.
 
 Variants: ``cold`` (each frame on its own), ``warm`` (each from the last one's network, with the preset's settings for
 that), ``key`` (each from the first frame's network), ``history`` (warm, with the samples of the neighbours that are in
@@ -12,10 +13,11 @@ the folder; ``candidate`` is its image before any guard), and any of them with s
 noisy, denoised and each variant for every frame, with the mean radiance over that of the smooth reference, the mean
 over the frames after the first (which is cold in any case), and the temporal error
 (:func:`selfcorrect.metrics.temporal_error`), the mean over all pairs of neighbours; and each as a share of the
-denoised image's.
+denoised image's. ``--save FILE.npz`` keeps the images of the first variant for ``scripts/bench/slice.py``.
 """
 
 import argparse
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -27,39 +29,47 @@ import denoisers
 from selfcorrect import Frame, Settings, correct, exr, metrics
 from selfcorrect.history import Histories
 
-ROLES = ("color", "albedo", "normal", "visibility", "depth")
+ROLES = ("color", "albedo", "normal", "visibility", "depth", "motion")
 
 
-def load(folder: Path, number: int, denoiser: str, threads: int) -> tuple[Frame, list[np.ndarray]]:
-    """A denoised frame and its references: two independent ones, and the smooth one."""
+def load(folder: Path, number: int, denoiser: str, threads: int, flow: bool = False) -> tuple[Frame, list[np.ndarray]]:
+    """A denoised frame and its references: two independent ones, and the smooth one; none where the folder has none."""
 
     def file(kind: str) -> Path:
         shot = next(folder.glob("*_ref_a.*.exr")).name.partition("_ref_a")[0]
         return folder / f"{shot}_{kind}.{number:04d}.exr"
 
     plugin = denoisers.create(denoiser, threads=threads)
-    a, b, *both = (exr.load_half(file(kind)).buffers for kind in ("a", "b", "ref_a", "ref_b"))
-    frame = Frame(**{role: (a[role], b[role]) for role in ROLES if role in a}).denoise(plugin, keep_aids=True)
+    roles = [role for role in ROLES if not (flow and role == "motion")]
+    a, b = (exr.load_half(file(kind), shot=True).buffers for kind in "ab")
+    frame = Frame(**{role: (a[role], b[role]) for role in roles if role in a}).denoise(plugin, keep_aids=True)
+    if not file("ref_a").exists():
+        return frame, []
+    both = [exr.load_half(file(kind)).buffers for kind in ("ref_a", "ref_b")]
     references = [np.asarray(buffers["color"]) for buffers in both]
     if file("ref_smooth").exists():
         references.append(exr.load_half(file("ref_smooth")).buffers["color"])
     else:
-        reference = Frame(**{role: (both[0][role], both[1][role]) for role in ROLES if role in both[0]})
+        reference = Frame(**{role: (both[0][role], both[1][role]) for role in roles if role in both[0]})
         references.append(np.asarray(reference.denoise(plugin).denoised_full))
     return frame, references
 
 
-def corrected(frames: list[Frame], preset: str, variant: str, denoiser: Any) -> tuple[list[Any], list[float]]:
-    """Images of one variant, and seconds of each."""
+def corrected(
+    frames: dict[int, Frame], numbers: list[int], preset: str, variant: str, denoiser: Any
+) -> tuple[list[Any], list[float]]:
+    """Images of one variant of the frames of these numbers, and seconds of each."""
     how, _, changes = variant.partition(":")
     pairs = dict(change.split("=") for change in changes.split(",") if change)
     settings = Settings.preset(preset, **{k: int(v) if v.isdigit() else float(v) for k, v in pairs.items()})
     images, seconds, last, first = [], [], None, None
     histories = Histories(settings.frame_radius if how in ("history", "candidate") else 0, denoiser)
-    for number, given in enumerate(frames):
-        start, frame = time.process_time(), given
+    for number in numbers:
+        start, frame = time.process_time(), frames[number]
         if histories.reach:
-            frame, _ = histories.of(number, {n: f for n, f in enumerate(frames) if abs(n - number) <= histories.reach})
+            around = {n: other for n, other in frames.items() if abs(n - number) <= histories.reach}
+            frame, history = histories.of(number, around)
+            print(number, *history.lines(), sep="; ", file=sys.stderr)
         if how == "candidate":
             images.append(frame.candidates[-1].full)
             seconds.append(time.process_time() - start)
@@ -77,24 +87,34 @@ def main() -> None:
     parser.add_argument("--preset", default=Settings.default())
     parser.add_argument("--denoiser", default="oidn")
     parser.add_argument("--variants", nargs="*", default=["cold", "warm"])
+    parser.add_argument("--flow", action="store_true", help="leave motion passes out")
+    parser.add_argument("--save", type=Path, metavar="NPZ", help="keep the first variant's images")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    numbers = sorted(int(p.name.split(".")[-2]) for p in options.folder.glob("*_ref_a.*.exr"))
+    found = sorted(int(p.name.split(".")[-2]) for p in options.folder.glob("*_a.*.exr") if "_ref_a" not in p.name)
     denoiser = denoisers.create(options.denoiser, threads=options.threads)
-    loaded = [load(options.folder, number, options.denoiser, options.threads) for number in numbers]
-    frames, references = [frame for frame, _ in loaded], [reference for _, reference in loaded]
+    loaded = {n: load(options.folder, n, options.denoiser, options.threads, options.flow) for n in found}
+    numbers = [number for number, (_, references) in loaded.items() if references]
+    shot = {number: frame for number, (frame, _) in loaded.items()}
+    frames, references = [shot[number] for number in numbers], [loaded[number][1] for number in numbers]
     print(f"preset {options.preset}, denoiser {options.denoiser}: relMSE (mean radiance) of each frame; CPU seconds")
     print(f"| | {' | '.join(map(str, numbers))} | after the first | temporal | seconds |")
     print(f"|---|{'---|' * (len(numbers) + 3)}")
-    row("noisy", [np.asarray((f.color[0] + f.color[1]) / 2) for f in frames], references, [0.0])
-    denoised = row(options.denoiser, [f.denoised_full for f in frames], references, [0.0])
+    noisy = [np.asarray((f.color[0] + f.color[1]) / 2) for f in frames]
+    row("noisy", noisy, references, [0.0])
+    denoised_images = [np.asarray(frame.denoised_full) for frame in frames]
+    denoised = row(options.denoiser, denoised_images, references, [0.0])
     for variant in options.variants:
-        images, seconds = corrected(frames, options.preset, variant, denoiser)
-        found = row(variant, images, references, seconds[1:])
-        each = [a / b for a, b in zip(found[0], denoised[0], strict=True)]
+        images, seconds = corrected(shot, numbers, options.preset, variant, denoiser)
+        measured = row(variant, images, references, seconds[1:])
+        each = [a / b for a, b in zip(measured[0], denoised[0], strict=True)]
         of = f"of {options.denoiser}: {' '.join(f'{ratio:.3f}' for ratio in each)}, mean {np.mean(each):.3f}"
-        print(f"{variant}, {of}, temporal {found[1] / denoised[1]:.3f}", flush=True)
+        print(f"{variant}, {of}, temporal {measured[1] / denoised[1]:.3f}", flush=True)
+        if options.save is not None and variant == options.variants[0]:
+            smooth = [(first + second) / 2 for first, second, _ in references]
+            kinds = {"noisy": noisy, options.denoiser: denoised_images, "corrected": images, "reference": smooth}
+            np.savez(options.save, **{name: np.stack(kind).astype(np.float16) for name, kind in kinds.items()})
 
 
 def row(

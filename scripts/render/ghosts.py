@@ -67,7 +67,6 @@ def build() -> None:
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.sample_clamp_direct = scene.cycles.sample_clamp_indirect = 0.0
-    scene.view_layers[0].use_pass_vector = True
     scene.world = bpy.data.worlds.new("world")
     if bpy.app.version < (5, 0, 0):
         scene.world.use_nodes = True
@@ -116,7 +115,7 @@ def main() -> None:
         scene.render.threads_mode, scene.render.threads = "FIXED", options.threads
     # references last: what needs none can be looked at before
     for samples, label in ((options.spp // 2, ""), (options.reference, "ref_")):
-        prepare(scene, samples, options.size)
+        prepare(scene, samples, options.size, shot=True)
         for frame in options.frames if samples else ():
             for half in "ab":
                 path = options.output / f"{NAME}_{label}{half}.{frame:04d}.exr"

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 
 from denoisers.host import FEATURES as DENOISER_FEATURES
-from selfcorrect.buffers import FEATURES, INPUTS
+from selfcorrect.buffers import FEATURES, INPUTS, MOTION, Buffer
 from selfcorrect.cli import flags
 from selfcorrect.cli.terminal import log
 from selfcorrect.errors import SettingsError
@@ -163,7 +163,7 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = 
     height, width = parts[0].data_window.size
     pixels = height * width
     held = max(map(_with_siblings, sources.paths))
-    features = _features(sources, parts, layer or None)
+    features = _features(sources, parts, layer or None, (*FEATURES, MOTION) if shot else FEATURES)
     half = pixels * (_RGB + sum(features.values()))
     image = pixels * _RGB
     aids = image * len(features.keys() & DENOISER_FEATURES)
@@ -232,8 +232,8 @@ def _with_siblings(path: str) -> int:
     return stored_bytes(path) + sum(stored_bytes(str(file)) for file in beside)
 
 
-def _features(sources: Sources, parts: list[Header], layer: str | None) -> dict[str, int]:
-    """Bytes of a pixel of each G-buffer of one half."""
+def _features(sources: Sources, parts: list[Header], layer: str | None, wanted: tuple[Buffer, ...]) -> dict[str, int]:
+    """Bytes of a pixel of each of these buffers of one half, as far as there are."""
     file = sources.a.partition("::")[0]
     named = [(part.name, [channel.name for channel in part.channels]) for part in parts]
     full = [name for names in channels.full_names(named, parts[0].views) for name in names]
@@ -241,9 +241,9 @@ def _features(sources: Sources, parts: list[Header], layer: str | None) -> dict[
     taken = channels.choose(full, file=file, layer=layer, mapping=sources.mapping)
     beside = channels.siblings(file)
     found = {}
-    for role in (feature.name for feature in FEATURES):
+    for role in (buffer.name for buffer in wanted):
         if role in taken:
-            found[role] = len(taken[role]) * max(_BYTES[types[name]] for name in taken[role])
+            found[role] = channels.ROLES[role] * max(_BYTES[types[name]] for name in taken[role])
         elif role in beside:
             found[role] = _RGB  # the most it can be: its file is not opened here
     return found

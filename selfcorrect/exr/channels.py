@@ -15,8 +15,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from selfcorrect.buffers import COLOR, FEATURES
+from selfcorrect.buffers import COLOR, FEATURES, MOTION
 from selfcorrect.errors import ChannelError, SettingsError
+from selfcorrect.exr import motion
 
 __all__ = [
     "LAYOUTS",
@@ -30,8 +31,8 @@ __all__ = [
     "siblings",
 ]
 
-ROLES = {buffer.name: buffer.channels for buffer in (COLOR, *FEATURES)} | {"alpha": 1}
-"""Every role and its number of channels."""
+ROLES = {buffer.name: buffer.channels for buffer in (COLOR, *FEATURES)} | {"alpha": 1, MOTION.name: MOTION.channels}
+"""Every role and its number of channels; motion may come as two (:mod:`selfcorrect.exr.motion`)."""
 
 _RGB = (".R", ".G", ".B")
 _XYZ = (".X", ".Y", ".Z")
@@ -92,6 +93,7 @@ TABLE = (
     Pass("visibility", "visibility", _SCALAR, "Tungsten, reference implementation"),
     Pass("alpha", "", (("A",),), "all of them; RenderMan writes a"),
     Pass("alpha", "Combined", ((".A",),), "Blender Cycles, whose Noisy Image may lack it"),
+    *(Pass(MOTION.name, row.name, row.components, row.writer) for row in motion.CONVENTIONS if row.found),
 )
 
 
@@ -354,16 +356,17 @@ def _lone_pass(names: Sequence[str]) -> list[str]:
 
 def _named(names: Sequence[str], role: str, wanted: str, layer: str | None, file: str) -> tuple[str, ...]:
     """Channels that the user names for a role, with or without the layer in front."""
-    count = ROLES[role]
+    counts = motion.COUNTS if role == MOTION.name else (ROLES[role],)
+    components = motion.alternatives(wanted) if role == MOTION.name else _SCALAR if counts == (1,) else (_RGB, _XYZ)
     single = [name.strip().casefold() for name in wanted.split(",")]
     for scope in (layer or "", ""):
         inside = _inside(names, scope)
         exact = tuple(inside[name] for name in single if name in inside)
-        if len(exact) == len(single) == count:
+        if len(exact) == len(single) and len(single) in counts:
             return exact
-        if found := _find(inside, Pass(role, wanted, _SCALAR if count == 1 else (_RGB, _XYZ), "")):
+        if found := _find(inside, Pass(role, wanted, components, "")):
             return found
-    expected = "one channel" if count == 1 else f"{count} channels"
+    expected = "one channel" if counts == (1,) else f"{' or '.join(map(str, counts))} channels"
     raise ChannelError(f"{file}: expected {expected} named '{wanted}' for {role}, but got {listed(names)}")
 
 

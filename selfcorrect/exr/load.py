@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcorrect.buffers import FEATURES
+from selfcorrect.buffers import FEATURES, MOTION
 from selfcorrect.errors import FrameError
-from selfcorrect.exr import channels
+from selfcorrect.exr import channels, motion
 from selfcorrect.exr.file import ExrFile, Pixels, float_type, headers, read
 from selfcorrect.exr.header import Window
 from selfcorrect.exr.passes import picture
 
 __all__ = ["HalfFile", "load_half", "load_picture"]
 
-_FEATURES = {feature.name for feature in FEATURES}
+_FEATURES = {feature.name for feature in (*FEATURES, MOTION)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +54,13 @@ def load_picture(path: str | Path) -> tuple[NDArray[np.floating[Any]], list[str]
     return _stacked([file.pixels(name) for name in shown], half=False), list(shown)
 
 
-def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None) -> HalfFile:
+def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None, shot: bool = False) -> HalfFile:
     """Read one half of a frame: colour and whichever G-buffers there are, in the file or in files beside it.
 
     Args:
         path: the colour file, or ``FILE.exr::LAYER``.
         mapping: role → channel name of the user's own (see :func:`selfcorrect.exr.channels.choose`).
+        shot: also motion, which only the neighbours of a shot's frame have use for.
 
     Raises:
         FileError: a file cannot be read.
@@ -69,7 +70,7 @@ def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None) -> 
     """
     file = read(path)
     chosen = channels.choose(file.channel_names, file=file.path, layer=file.layer, mapping=mapping)
-    sources = {role: (file, names) for role, names in chosen.items()}
+    sources = {role: (file, names) for role, names in chosen.items() if shot or role != MOTION.name}
     for role, sibling in channels.siblings(file.path).items():
         if role not in sources:
             _check_size(file, role, str(sibling))
@@ -85,6 +86,8 @@ def load_half(path: str | Path, *, mapping: Mapping[str, str] | None = None) -> 
                     f"{tuple(window)}, but got {tuple(_window(source, name))}"
                 )
         buffers[role] = _stacked([source.pixels(name) for name in names], half=role in _FEATURES)
+        if role == MOTION.name:
+            buffers[role] = motion.read(names, buffers[role])
         prefix = "" if source is file else f"{Path(source.path).name}:"
         taken[role] = [prefix + name for name in names]
     for name in chosen["color"]:

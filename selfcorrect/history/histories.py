@@ -12,7 +12,7 @@ import torch
 
 from selfcorrect.frame import Candidate, Frame, mean
 from selfcorrect.history.gather import averaged, gathered
-from selfcorrect.history.motion import Motion, between, picture
+from selfcorrect.history.motion import Motion, between, chained, picture
 from selfcorrect.independence import dependence
 
 __all__ = ["NAME", "Histories", "History", "with_history"]
@@ -32,10 +32,12 @@ class History(NamedTuple):
         found: by distance in frames, negative before, the mean weight of a neighbour's pixels: 1 where each is the same
             surface in the same light.
         left_out: by distance, why a neighbour was not used.
+        told: share of the pixels that moved as the files tell, and not by optical flow; None where they tell nothing.
     """
 
     found: Mapping[int, float] = {}
     left_out: Mapping[int, str] = {}
+    told: float | None = None
 
     @property
     def samples(self) -> float:
@@ -48,7 +50,16 @@ class History(NamedTuple):
             return ["no history: no neighbour shows what this frame shows", *self._left_out()]
         found = ", ".join(f"{distance:+d}: {100 * share:.0f} %" for distance, share in self.found.items())
         of = f"history of {len(self.found)} frames: pixels found {found}; {self.samples:.1f} frames' samples a pixel"
-        return [of, *self._left_out()]
+        return [of, self._motion(), *self._left_out()]
+
+    def _motion(self) -> str:
+        if self.told is None:
+            return "motion: by optical flow"
+        if not self.told:
+            return "motion: by optical flow; the files' own does not fit what the frames show"
+        return (
+            f"motion: the files' own at {100 * self.told:.0f} % of the pixels, else by optical flow, which fits better"
+        )
 
     def _left_out(self) -> list[str]:
         return [f"history: the frame at {distance:+d} {reason}; left out" for distance, reason in self.left_out.items()]
@@ -59,6 +70,7 @@ class History(NamedTuple):
             "found": {str(distance): share for distance, share in self.found.items()},
             "left_out": {str(distance): reason for distance, reason in self.left_out.items()},
             "samples": self.samples,
+            "motion_of_files": self.told,
         }
 
 
@@ -110,7 +122,8 @@ class Histories:
             image, found = averaged(frames[number], _images(mine)[which], given)
             images.append(image)
         if self._denoiser is None:
-            history = History({n - number: share for n, share in found.items()}, left_out)
+            found = {n - number: share for n, share in found.items()}
+            history = History(found, left_out, self._told(number, around, frames))
         return frame.with_candidate(Candidate(NAME, (images[0], images[1]), images[2])), history
 
     def _with_aids(self, number: int, frame: Frame) -> Frame:
@@ -146,7 +159,8 @@ class Histories:
             torch.as_tensor(self._denoiser(color, **aids)).clamp(min=0)
             for color, aids in zip((mean((halves[0], halves[1])), *halves), frame.aids or (), strict=True)
         )
-        return Candidate(NAME, (a, b), full), History({n - number: share for n, share in found.items()}, left_out)
+        found = {n - number: share for n, share in found.items()}
+        return Candidate(NAME, (a, b), full), History(found, left_out, self._told(number, around, frames))
 
     def _neighbours(self, number: int, frames: Mapping[int, Frame], radius: int) -> tuple[list[int], dict[int, str]]:
         """Those that can be used, and why the others cannot. A frame of another size ends the search on its side."""
@@ -176,9 +190,16 @@ class Histories:
 
     def _motion(self, one: int, other: int, frames: Mapping[int, Frame]) -> Motion:
         if (one, other) not in self._motions:
-            there, back = between(picture(frames[one]), picture(frames[other]))
+            told = _told(one, other, frames), _told(other, one, frames)
+            there, back = between(picture(frames[one]), picture(frames[other]), told)
             self._motions[one, other], self._motions[other, one] = there, back
         return self._motions[one, other]
+
+    def _told(self, number: int, around: list[int], frames: Mapping[int, Frame]) -> float | None:
+        """Share of the pixels whose motion is that of the files; None where they tell none."""
+        if frames[number].motion is None:
+            return None
+        return sum(self._motion(number, n, frames).told for n in around) / len(around)
 
     def _forget(self, frames: Mapping[int, Frame]) -> None:
         self._gathered = {n: made for n, made in self._gathered.items() if n in frames}
@@ -203,6 +224,14 @@ def with_history(
         MissingPackageError: there is no optical flow.
     """
     return Histories(radius, denoiser).of(0, {0: frame, **neighbours})
+
+
+def _told(one: int, other: int, frames: Mapping[int, Frame]) -> torch.Tensor | None:
+    """Offsets by what the files of the frames on the way tell; None where one of them is not there."""
+    side = 1 if other > one else -1
+    way = [frames.get(n) for n in range(one, other + side, side)]
+    there = [frame for frame in way if frame is not None and frame.size == frames[one].size]
+    return chained(there, side) if len(there) == len(way) else None
 
 
 def _images(candidate: Candidate) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -2,10 +2,16 @@
 
 One convention: an offset is in pixels, x to the right and y downwards, from the pixel in this frame to the place of its
 surface in the other one.
+
+The renderer's own motion, where the files hold it, is exact on surfaces, and wrong where it was not set up as it was
+taken for, and in mirrors and glass, whose pictures move otherwise. Optical flow is about right in most places. So each
+is judged by what it brings, the other frame's albedo, normal and radiance: pixel by pixel the renderer's is taken
+unless flow fits clearly better around, and over the frame it is not used at all where it mostly does not fit.
 """
 
 import importlib
 import importlib.util
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,12 +23,17 @@ from selfcorrect.errors import MissingPackageError
 from selfcorrect.frame import Frame, mean
 from selfcorrect.image.bands import bands
 
-__all__ = ["Motion", "available", "between", "features", "fetched", "optical_flow", "picture", "warped"]
+__all__ = ["Motion", "available", "between", "chained", "features", "fetched", "optical_flow", "picture", "warped"]
 
 _TOLERANCE = 1.5  # pixels that the flow forward and back may miss its start by
 _SHARES = (0.4, 0.2, 0.4)  # of albedo, normal and tone-mapped radiance in the picture that flow is found in
 _LIGHT = (0.5, 0.3, 0.2)  # a direction: shading by it turns normals into grey
 _LEAST_SIDE = 16  # pixels: OpenCV's search fails below
+_AROUND = 5  # side of the window whose mean squared difference is compared
+_BETTER = 2.0  # times smaller than that of the files' motion flow's must be, to be taken: of noise it is somewhat
+_UNFIT = 1.5  # times flow's median, above which the files' motion is no motion of this frame. In the ghost shot it is
+# 0.6 … 1.0, and 1.7 … 7 if zero, 3 … 54 if negated, 1.3 … 2 if halved
+_ROUNDING = 1e-6  # squared: below a quarter of the 8 bits that flow sees, all fits
 
 
 class Motion(NamedTuple):
@@ -31,10 +42,12 @@ class Motion(NamedTuple):
     Attributes:
         offset: (H, W, 2), x and y in pixels.
         known: (H, W), whether it is to be believed there, and leads to a pixel of the other.
+        told: share of the pixels whose offset the files told, 0 … 1.
     """
 
     offset: Tensor
     known: Tensor
+    told: float = 0.0
 
 
 def available() -> bool:
@@ -94,18 +107,65 @@ def optical_flow(image: Tensor, other: Tensor) -> Tensor:
     return flow.to(image.device)
 
 
-def between(image: Tensor, other: Tensor) -> tuple[Motion, Motion]:
-    """Motion from one picture (see :func:`picture`) to another and back, by optical flow.
+def chained(frames: Sequence[Frame], side: int) -> Tensor | None:
+    """Offsets (H, W, 2) from the first of neighbouring frames to the last, by what the files of all but that tell.
+
+    Args:
+        frames: two or more of one size.
+        side: −1 where each is the one before the other, else 1.
+
+    Returns:
+        NaN where it is unknown; None where a frame tells nothing.
+    """
+    offset = None
+    for frame in frames[:-1]:
+        if frame.motion is None:
+            return None
+        told = mean(frame.motion)[..., :2] if side < 0 else mean(frame.motion)[..., 2:]
+        offset = told if offset is None else offset + fetched(told, offset.nan_to_num())
+    return offset
+
+
+def between(
+    image: Tensor, other: Tensor, told: tuple[Tensor | None, Tensor | None] = (None, None)
+) -> tuple[Motion, Motion]:
+    """Motion from one picture (see :func:`picture`) to another and back.
 
     Each is believed where the other leads back to where it began.
+
+    Args:
+        image: (H, W) in 0 … 1.
+        other: the same size.
+        told: offsets there and back that the files tell (:func:`chained`), taken where they fit; else it is optical
+            flow.
     """
-    forward, backward = optical_flow(image, other), optical_flow(other, image)
+    forward, share_forward = _fitting(image, other, optical_flow(image, other), told[0])
+    backward, share_backward = _fitting(other, image, optical_flow(other, image), told[1])
 
-    def believed(there: Tensor, back: Tensor) -> Motion:
+    def believed(there: Tensor, back: Tensor, share: float) -> Motion:
         missed = (there + fetched(back, there)).square().sum(-1)
-        return Motion(there, _inside(there) & (missed <= _TOLERANCE**2))
+        return Motion(there, _inside(there) & (missed <= _TOLERANCE**2), share)
 
-    return believed(forward, backward), believed(backward, forward)
+    return believed(forward, backward, share_forward), believed(backward, forward, share_backward)
+
+
+def _fitting(image: Tensor, other: Tensor, flow: Tensor, told: Tensor | None) -> tuple[Tensor, float]:
+    """Of flow and of what the files tell, what fits; and the share of the latter."""
+    if told is None:
+        return flow, 0.0
+    known = told.isfinite().all(-1)
+    told = told.nan_to_num()
+    by_files, by_flow = (_difference(image, other, offset) for offset in (told, flow))
+    if not bool(known.any()) or by_files[known].median() > _UNFIT * by_flow[known].median() + _ROUNDING:
+        return flow, 0.0
+    taken = known & (by_files <= _BETTER * by_flow + _ROUNDING)
+    return torch.where(taken[..., None], told, flow), float(taken.float().mean())
+
+
+def _difference(image: Tensor, other: Tensor, offset: Tensor) -> Tensor:
+    """Of a picture (H, W) and of another that offsets bring here, squared, the mean around each pixel."""
+    squared = (warped(other[..., None], offset)[..., 0] - image).square()
+    return F.avg_pool2d(squared[None], _AROUND, 1, _AROUND // 2, count_include_pad=False)[0]
 
 
 def fetched(image: Tensor, offset: Tensor) -> Tensor:

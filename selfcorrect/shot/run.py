@@ -277,7 +277,7 @@ class _Run:
     def _load(self, frame: int) -> files.Loaded | Exception:
         """In the reader's thread. What is wrong with a file is for the frames that need it to tell."""
         try:
-            return files.load(self.shot.sources(frame))
+            return files.load(self.shot.sources(frame), shot=self.options.reach > 0)
         except Exception as error:
             return error
 

@@ -62,10 +62,10 @@ def test_an_odd_output_is_made_again(run: Any, shot_folder: Path, sequence: Run)
 
 
 def test_any_exception_is_that_of_its_frame(shot_folder: Path, sequence: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def odd(sources: Any) -> Any:
+    def odd(sources: Any, **how: Any) -> Any:
         if "0002" in sources.a:
             raise KeyError("odd")
-        return load(sources)
+        return load(sources, **how)
 
     load = files.load
     monkeypatch.setattr("selfcorrect.files.load", odd)

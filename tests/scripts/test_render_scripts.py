@@ -10,11 +10,13 @@ from typing import Any
 import halves
 import numpy as np
 import pytest
+import torch
 from helpers.exr_files import assert_passed_through, rewrite, three
-from helpers.render_scripts import BLENDER, BLENDER_TAKEN, done, refused
+from helpers.render_scripts import BLENDER, BLENDER_TAKEN, CHECKOUT, done, refused
 
 from selfcorrect import exr, files
 from selfcorrect.errors import SettingsError
+from selfcorrect.history.motion import warped
 from selfcorrect.independence import doubts
 from selfcorrect.shot import framerange
 
@@ -221,8 +223,9 @@ def test_halves_from_blender(blend: Path, tmp_path: Path) -> None:
     # the file's own settings are Blender's: its denoiser, a wide filter and adaptive sampling
     assert_halves(tmp_path, "room", [1, 24], BLENDER_TAKEN)
     assert blend.read_bytes() == before
-    first = exr.load_half(tmp_path / "room_a.0001.exr")
-    assert len(first.file.parts) == 4
+    first = exr.load_half(tmp_path / "room_a.0001.exr", shot=True)
+    assert len(first.file.parts) == 5
+    assert first.taken["motion"] == three("ViewLayer.Vector", "XYZW")
     assert first.file.parts[0].header["cycles.ViewLayer.samples"] == "2"
 
 
@@ -265,3 +268,31 @@ def test_what_a_user_of_blender_can_fix(blend: Path, tmp_path: Path, code: str, 
     line = refused("render/render_blender", changed(blend, code), "-o", tmp_path, "--spp", 2, "--size", "32x18")
     assert word in line
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> dict[int, exr.HalfFile]:
+    """Frames 5 and 6 of a shot whose camera and objects move."""
+    folder = tmp_path_factory.mktemp("moving")
+    command = [BLENDER, CHECKOUT / "scripts/render/ghosts.py", "-o", folder, "--frames", "5-6", "--spp", "8"]
+    command += ["--reference", "0", "--size", "144x84", "--threads", "1"]
+    subprocess.run(list(map(str, command)), check=True, capture_output=True, timeout=300)
+    return {n: exr.load_half(folder / f"ghosts_a.{n:04d}.exr", shot=True) for n in (5, 6)}
+
+
+@pytest.mark.blender
+@pytest.mark.parametrize(("here", "there", "side"), [(6, 5, 0), (5, 6, 2)])
+def test_motion_from_blender_leads_to_the_same_surface(
+    moving: dict[int, exr.HalfFile], here: int, there: int, side: int
+) -> None:
+    """Its signs: albedo fetched along them fits, and along no others, nor along none."""
+    albedo, other = (torch.from_numpy(moving[n].buffers["albedo"]) for n in (here, there))
+    motion = torch.from_numpy(moving[here].buffers["motion"])[..., side : side + 2]
+    assert motion.abs().mean() > 0.5
+
+    def difference(*signs: float) -> float:
+        return float((warped(other, motion * torch.tensor(signs)) - albedo).abs().mean())
+
+    right, *wrong = (difference(x, y) for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0)))
+    assert right < 0.85 * min(wrong)
+    assert right < 0.6 * wrong[-1]

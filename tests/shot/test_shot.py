@@ -245,8 +245,8 @@ def test_frames_are_read_ahead_and_written_behind(shot_folder: Path, monkeypatch
     most = 0
     load = files.load
 
-    def watched(sources: files.Sources) -> files.Loaded:
-        loaded = load(sources)
+    def watched(sources: files.Sources, **how: bool) -> files.Loaded:
+        loaded = load(sources, **how)
         alive.append(weakref.ref(loaded))
         read[len(alive)].set()
         return loaded
