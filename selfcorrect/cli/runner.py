@@ -95,19 +95,22 @@ class Runner:
             raise SettingsError(f"expected the guard with --diagnostics {named}, but got settings that turn it off")
         self._stages = stages.opened(self.settings)
         self._extra_files = flags.extra_files(options, self.settings)
-        wanted = getattr(options, "aovs", None) or "none"
-        if wanted != "none" and given and options.denoiser is None:
-            raise SettingsError(f"expected --denoiser NAME with --aovs {wanted}, which are denoised too, but got none")
         if given and options.denoiser is None:
             self._check_denoiser(" which have to be denoised too,")
         _use_machine(options)
         self._options = options
         self._told: dict[str, dict[str, list[str]]] = {}
         self._denoise = None
+        self._aovs_denoise: Callable[..., Any] | None = None
         if options.denoiser is not None or not given:
             self._denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
             if options.denoiser is None and denoisers.fallback():
                 log(denoisers.fallback())
+        if (getattr(options, "aovs", None) or "none") != "none":
+            self._aovs_denoise = self._denoise
+            if self._aovs_denoise is None:
+                self._aovs_denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
+                log(f"AOVs: denoised by {self._spec}: --denoised-a and --denoised-b are of the picture alone")
         self._further = {}
         if self._denoise is not None and self.settings.guard and self.settings.candidates != "none":
             self._further = {
@@ -184,9 +187,9 @@ class Runner:
         """Channels of the AOVs that the user wants corrected, and what is to be told of them."""
         if not origin.plan.written:
             return {}, {}
-        assert self._denoise is not None  # checked before the frame was read
+        assert self._aovs_denoise is not None  # there would be no plan
         start = time.perf_counter()
-        denoise = denoiser_of(frame, self._denoise)
+        denoise = denoiser_of(frame, self._aovs_denoise)
         a, b = origin.reopened()
         assert b is not None  # there would be no plan
         through = self._options.pass_through
@@ -209,8 +212,6 @@ class Runner:
             for name, paths in self._extra_files.items()
         }
         seconds = {"read": time.perf_counter() - began}
-        if loaded.origin.plan.written and self._denoise is None:
-            raise SettingsError("expected --denoiser NAME with --aovs, which are denoised too, but got none")
         denoiser = "given"
         if frame.denoised is None or self._options.denoiser is not None:  # who is named beats files found beside
             denoiser, start = self.denoiser, time.perf_counter()
