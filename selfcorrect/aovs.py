@@ -9,12 +9,12 @@ Two steps make of them what sums:
 2. The corrected picture c and Σ_k x_k leave a gap. It is divided, the minimum-variance estimate under constraints:
 
        minimise Σ_k (o_k - x_k)² / v_k   subject to   Σ_k o_k = c,   o_k ≥ 0,
-       v_k = √M_k (mean_rgb(x_k)² + 0.01),   M_k = mean over pixels of ‖x_k^a - x_k^b‖² / (mean_rgb(x_k)² + 0.01).
+       v_k = M_k (mean_rgb(x_k)² + 0.3),   M_k = mean over pixels of ‖x_k^a - x_k^b‖² / (mean_rgb(x_k)² + 0.3),
 
-   Its solution is o_k = max(x_k + λ v_k, 0), with one λ a pixel and colour channel. v_k has the form of the metric's
-   error: what an AOV takes on is the less the darker it is, since there it counts more, and the less its halves differ
-   over the frame. M_k is one number an AOV: taken over tiles it follows fireflies and edges, and made passes worse. Its
-   root stands between least harm in the sum over AOVs (M_k) and AOVs that are all alike (1).
+   in radiance of a mean near 1. The solution is o_k = max(x_k + λ v_k, 0), with one λ a pixel and colour channel. So
+   what is minimised is the sum over AOVs of the error that each takes on, weighed as the metric does, relative to the
+   one that it has, as far as its halves tell. M_k is one number an AOV: taken over tiles it follows fireflies and
+   edges, and made passes worse.
 
 Nothing appears where both halves of a pass are exactly 0 for a pixel and its neighbours, or where its colour is 0, but
 where the picture has light that no pass has: the sum comes first.
@@ -46,7 +46,8 @@ Denoise = Callable[[Pair], tuple[tuple[Tensor, Tensor], Tensor]]
 """From noisy halves to denoised halves and the denoised mean."""
 
 _EMPTY = 1  # pixels around one that have to be 0 for it to be none of the pass
-_DARKEST = 0.01  # squared radiance, of a mean near 1; that of the metric and of the guard
+_DARKEST = 0.3  # squared radiance, of a mean near 1; results are alike from 0.1 to 1
+_ROWS = 16  # of all AOVs that are worked on at once
 _LEAST = 1e-12  # M of an AOV whose halves are alike: the gap goes elsewhere, if it can
 
 
@@ -169,8 +170,8 @@ class _Part:
         x: step 1, (H, W, 3); made to sum in place.
         there: where it may have light: (H, W, 1), or (H, W, 3) with a colour.
         color: what it will be divided by.
-        spread: √M of step 2.
-        darkest: 0.01 of its formulas, in the units of x.
+        spread: M of step 2.
+        darkest: 0.3 of its formulas, in the units of x.
     """
 
     x: Tensor
@@ -236,7 +237,7 @@ def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: 
         return (squared / ((scale * x[rows].double()).mean(-1) ** 2 + _DARKEST))[None]
 
     (spread,) = average(tile_means(size[0], differences), size)
-    return _Part(x, there, color, math.sqrt(spread + _LEAST), darkest)
+    return _Part(x, there, color, spread + _LEAST, darkest)
 
 
 def _there(halves: tuple[Tensor, Tensor], color: Tensor | None, rows: slice) -> Tensor:
@@ -250,7 +251,7 @@ def _there(halves: tuple[Tensor, Tensor], color: Tensor | None, rows: slice) -> 
 def _reconcile_(parts: Sequence[_Part], target: Tensor) -> tuple[float, float]:
     """Make parts sum to the target, in place; the gap that was there and the one that is left, relative to it."""
     before = after = level = 0.0
-    for rows in bands(target.shape[0]):
+    for rows in bands(target.shape[0], _ROWS):
         wanted = target[rows].double()
         x = torch.stack([part.x[rows].double() for part in parts])
         v = torch.stack([part.variance(rows) for part in parts])

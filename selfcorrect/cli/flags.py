@@ -51,7 +51,7 @@ def add_layers(parser: argparse.ArgumentParser) -> None:
         dest="view_layers",
         default=ALL,
         metavar="NAME,NAME",
-        help="correct these view layers, or views, of the files, each with its own passes; by default all",
+        help="view layers, or views, to correct; by default all of the files'",
     )
 
 

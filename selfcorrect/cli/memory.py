@@ -40,7 +40,7 @@ _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
 class Needs(NamedTuple):
-    """Peak bytes of each stage; that of denoising without what OIDN takes beside its images."""
+    """Peak bytes of each stage; those of denoising and of AOVs without what OIDN takes beside its images."""
 
     read: float
     denoise: float
@@ -88,7 +88,7 @@ def scratch_within(
             f"{sources.a}: expected --maxmem of at least {least:.1f}G for a frame of this size and these channels "
             f"(most of it to {stage}), but got {limit / GIB:.1f}G"
         )
-    return int(limit - found.denoise - _OIDN)
+    return int(limit - max(found.denoise, found.aovs) - _OIDN)
 
 
 def fitted(
@@ -145,7 +145,8 @@ def reduced(
 
 
 def _with_denoiser(found: Needs) -> dict[str, float]:
-    return dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
+    least = _OIDN + _LEAST_SCRATCH
+    return dict(found._asdict(), denoise=found.denoise + least, aovs=found.aovs + least if found.aovs else 0.0)
 
 
 def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False, layers: int = 1) -> Needs:
@@ -197,10 +198,10 @@ def _corrects(sources: Sources) -> bool:
 
 
 def _of_aovs(pixels: int, count: int, half: float, held: float) -> float:
-    """At most every channel is of an AOV, each of which is kept as a whole and as half floats of both halves."""
+    """At most every channel is of an AOV, each of which is kept in float32, with where it has light, and as written."""
     image = pixels * _RGB
-    kept = 2 * image * (count / 3)
-    working = 12 * image  # denoised halves and their mean, the gaps and sums, the guides of each, one AOV's evidence
+    kept = 1.25 * image * (count / 3) + held
+    working = 12 * image  # denoised halves and their mean, the guides of each, one AOV's evidence
     return _BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
 
 
