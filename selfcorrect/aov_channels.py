@@ -91,7 +91,7 @@ def _sum(
         for aov in own
         if aov.color is not None
     }
-    sums = AovSum(group.name, Halves(*halves, own), group.remainder, colors, whole=not shared)
+    sums = AovSum(group.name, Halves(*halves, own), group.remainder, colors)
     corrected = correct_aovs(rest.clamp(min=0), frame, sums, denoise)
     found.facts[group.name] = {
         "noisy": max(group.closing, default=0.0),

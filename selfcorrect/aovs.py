@@ -1,27 +1,26 @@
 """AOVs that sum to the corrected picture. Tensors in, tensors out.
 
 Each AOV k of a sum is denoised by the denoiser of the picture, from each half and from both: z_k^a, z_k^b and z_k.
-Three steps make of them what sums:
+Two steps make of them what sums:
 
-1. The guard (:mod:`selfcorrect.guard`) blends the noisy mean in as far as the halves confirm it: x_k. Passes that
-   hardly have noise, such as emission and the environment, are better than what a denoiser makes of them.
-2. The corrected picture c and Σ_k x_k leave a gap. Whose it is, the halves tell: with the gap h^a of half a alone and
-   an AOV's share of it by its radiance, s_k^a = h^a x_k^a / Σ_j x_j^a, the witness y_k^b is unbiased, and
+1. The guard (:mod:`selfcorrect.guard`), an AOV's own halves its witness, blends the noisy mean in as far as they
+   confirm it: x_k, and x_k^a, x_k^b. Passes that hardly have noise, such as emission and the environment, are better
+   than what a denoiser makes of them.
+2. The corrected picture c and Σ_k x_k leave a gap. It is divided, the minimum-variance estimate under constraints:
 
-       n_k = w (y_k^b - x_k^a)·s_k^a,   d_k = w ‖s_k^a‖²,   w = 1 / (mean_rgb(x_k^a)² + 0.01)
+       minimise Σ_k (o_k - x_k)² / v_k   subject to   Σ_k o_k = c,   o_k ≥ 0,
+       v_k = M_k (mean_rgb(x_k)² + 0.3),   M_k = mean over pixels of ‖x_k^a - x_k^b‖² / (mean_rgb(x_k)² + 0.3),
 
-   averaged over tiles and both directions give α_k = n_k / d_k, the part of its share that an AOV really misses. It
-   plays the variance's part in what follows: v_k = α_k x_k, relative to the picture's radiance in the pixel.
-3. The gap is divided, the minimum-variance estimate under the constraints:
-
-       minimise Σ_k (o_k - x_k)² / v_k   subject to   Σ_k o_k = c,   o_k ≥ 0.
-
-   Its solution is o_k = max(x_k + λ v_k, 0), with one λ a pixel and colour channel.
+   in radiance of a mean near 1. The solution is o_k = max(x_k + λ v_k, 0), with one λ a pixel and colour channel. So
+   what is minimised is the sum over AOVs of the error that each takes on, weighed as the metric does, relative to the
+   one that it has, as far as its halves tell. M_k is one number an AOV: taken over tiles it follows fireflies and
+   edges, and made passes worse.
 
 Nothing appears where both halves of a pass are exactly 0 for a pixel and its neighbours, or where its colour is 0, but
 where the picture has light that no pass has: the sum comes first.
 
-Measured with `scripts/bench/aovs.py`, beside the ratio method and beside denoising each AOV alone.
+Measured with `scripts/bench/aovs.py`, beside the ratio method and denoising each AOV alone; Eq. 10 with AOVs as payload
+of the picture's weights hardly added to it.
 """
 
 import math
@@ -47,11 +46,9 @@ Denoise = Callable[[Pair], tuple[tuple[Tensor, Tensor], Tensor]]
 """From noisy halves to denoised halves and the denoised mean."""
 
 _EMPTY = 1  # pixels around one that have to be 0 for it to be none of the pass
-_SIDE = 32  # of the tiles of α
-_COMMON = 0.3  # of the frame's evidence that every tile is given
-_LEAST_SHARE = 0.1  # is added to α: any AOV may miss something
-_LARGEST_SHARE = 1.5
-_LARGEST_HALF = 60000.0  # what is kept as half floats
+_DARKEST = 0.3  # squared radiance, of a mean near 1; results are alike from 0.1 to 1
+_ROWS = 16  # of all AOVs that are worked on at once
+_LEAST = 1e-12  # M of an AOV whose halves are alike: the gap goes elsewhere, if it can
 
 
 @dataclass(frozen=True)
@@ -64,15 +61,12 @@ class AovSum:
             divided by a colour. A mapping that makes them when they are asked for keeps memory low.
         remainder: the AOVs are only a part of the picture; what they leave of it takes part, and is not given back.
         colors: (H, W, 3) colour by the name of each AOV that will be divided by it.
-        whole: they sum to the frame's picture; else, as where some of a set are known already, to what is left of it,
-            and their gap is divided by radiance alone.
     """
 
     name: str
     halves: Mapping[str, Pair]
     remainder: bool = False
     colors: Mapping[str, Tensor] = field(default_factory=dict)
-    whole: bool = True
 
 
 class Corrected(NamedTuple):
@@ -133,10 +127,6 @@ def correct_aovs(image: Any, frame: Frame, sums: AovSum, denoise: Denoise) -> Co
         parts[name] = _part(halves, denoise, scale, sums.colors.get(name))
         if name:
             repairs[name] = counts
-    if sums.whole:
-        gaps, totals = _gaps(frame, list(parts.values()), scale)
-        for name, (halves, _) in _noisy(frame, sums):
-            parts[name].share = _share(parts[name], halves, gaps, totals, scale)
     gap, closing = _reconcile_(list(parts.values()), target)
     return Corrected({name: part.x for name, part in parts.items() if name}, repairs, gap, closing)
 
@@ -148,7 +138,7 @@ def correct_alone(frame: Frame, name: str, halves: Pair, denoise: Denoise) -> Te
 
 
 def reconciled(x: Tensor, v: Tensor, target: Tensor) -> Tensor:
-    """The o of step 3.
+    """The o of step 2.
 
     Args:
         x: (K, …) ≥ 0.
@@ -178,20 +168,23 @@ class _Part:
 
     Attributes:
         x: step 1, (H, W, 3); made to sum in place.
-        halves: the same of each half, half floats of the frame's scale.
+        there: where it may have light: (H, W, 1), or (H, W, 3) with a colour.
         color: what it will be divided by.
-        share: α of step 2, over tiles, (1, h, w).
+        spread: M of step 2.
+        darkest: 0.3 of its formulas, in the units of x.
     """
 
     x: Tensor
-    halves: tuple[Tensor, Tensor]
+    there: Tensor
     color: Tensor | None
-    share: Tensor
+    spread: float
+    darkest: float
 
     def variance(self, rows: slice) -> Tensor:
         """v at rows of the image."""
-        share = enlarged_rows(self.share, (self.x.shape[0], self.x.shape[1]), rows).permute(1, 2, 0)
-        return share * self.x[rows].double()
+        x = self.x[rows].double()
+        level = x.mean(-1, keepdim=True) ** 2 + self.darkest
+        return torch.where(self.there[rows], self.spread * level, 0.0).expand_as(x)
 
     def anywhere(self, rows: slice) -> Tensor:
         """What divides light that no pass has: alike, but for a pass whose colour is 0."""
@@ -220,10 +213,10 @@ def _checked(frame: Frame, name: str, halves: Pair) -> tuple[tuple[Tensor, Tenso
 def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: Tensor | None) -> _Part:
     """Step 1: an AOV denoised and blended, as a whole and of each half."""
     size = (halves[0].shape[0], halves[0].shape[1])
-    alike = torch.ones(1, 1, 1, dtype=torch.float64)
+    there = torch.cat([_there(halves, color, rows) for rows in bands(size[0])])
+    darkest = _DARKEST / scale**2
     if not any(bool(half.any()) for half in halves):
-        dark = torch.zeros(*size, 3, dtype=torch.float16)
-        return _Part(torch.zeros(*size, 3), (dark, dark), color, alike)
+        return _Part(torch.zeros(*size, 3), there, color, 0.0, darkest)
     denoised, full = denoise(halves)
     y = (Scaled(halves[0], scale), Scaled(halves[1], scale))
     z = (Scaled(denoised[0], scale), Scaled(denoised[1], scale))
@@ -233,16 +226,18 @@ def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: 
     noisy = Scaled(mean(halves), scale)
     guarded = guard(evidence, Scaled(full, scale), [noisy], scale=scale, out=torch.empty_like(full))
     x = scale_(guarded.image, 1 / scale).clamp_(min=0)
-    kept = (torch.empty(*size, 3, dtype=torch.float16), torch.empty(*size, 3, dtype=torch.float16))
     for rows in bands(size[0]):
+        x[rows] = torch.where(there[rows], x[rows], 0.0)
+
+    def differences(rows: slice) -> Tensor:
+        """‖x^a - x^b‖², relative."""
         alpha = enlarged_rows(guarded.alpha, size, rows)[0][:, :, None]
-        there = _there(halves, color, rows)
-        x[rows] = torch.where(there, x[rows], 0.0)
-        for i, half in enumerate(kept):
-            start = z[i][rows].double()
-            blended = start + alpha * (y[i][rows].double() - start)
-            half[rows] = torch.where(there, blended, 0.0).clamp(0, _LARGEST_HALF)
-    return _Part(x, kept, color, alike)
+        a, b = (z[i][rows].double() + alpha * (y[i][rows].double() - z[i][rows].double()) for i in (0, 1))
+        squared = torch.where(there[rows], (a - b) ** 2, 0.0).mean(-1)
+        return (squared / ((scale * x[rows].double()).mean(-1) ** 2 + _DARKEST))[None]
+
+    (spread,) = average(tile_means(size[0], differences), size)
+    return _Part(x, there, color, spread + _LEAST, darkest)
 
 
 def _there(halves: tuple[Tensor, Tensor], color: Tensor | None, rows: slice) -> Tensor:
@@ -253,41 +248,10 @@ def _there(halves: tuple[Tensor, Tensor], color: Tensor | None, rows: slice) -> 
     return there if color is None else there & (color[rows] > 0)
 
 
-def _gaps(frame: Frame, parts: Sequence[_Part], scale: float) -> tuple[list[Tensor], list[Tensor]]:
-    """Of each half, the gap between the denoised picture and the sum, and the sum, in the frame's scale."""
-    totals = [torch.zeros(*frame.size, 3), torch.zeros(*frame.size, 3)]
-    for part in parts:
-        for total, half in zip(totals, part.halves, strict=True):
-            total.add_(half)
-    pictures = [Scaled(half, scale) for half in frame.candidates[0].halves]
-    return [picture[slice(None)] - total for picture, total in zip(pictures, totals, strict=True)], totals
-
-
-def _share(
-    part: _Part, halves: tuple[Tensor, Tensor], gaps: Sequence[Tensor], totals: Sequence[Tensor], scale: float
-) -> Tensor:
-    """α of step 2, over tiles, (1, h, w)."""
-    size = (part.x.shape[0], part.x.shape[1])
-
-    def evidence(rows: slice) -> Tensor:
-        both = torch.zeros(2, rows.stop - rows.start, size[1], dtype=torch.float64)
-        for i in (0, 1):
-            x, witness = part.halves[i][rows].double(), Scaled(halves[1 - i], scale)[rows].double()
-            share = gaps[i][rows].double() * (x / totals[i][rows].double().clamp(min=1e-12))
-            weight = 1 / (x.mean(-1) ** 2 + 0.01 * scale**2)
-            both += weight * torch.stack([((witness - x) * share).mean(-1), (share**2).mean(-1)])
-        return both
-
-    tiles = tile_means(size[0], evidence, _SIDE)
-    nd = tiles + _COMMON * torch.tensor(average(tiles, size, _SIDE), dtype=torch.float64)[:, None, None]
-    ratio = nd[:1] / nd[1:].clamp(min=torch.finfo(torch.float64).tiny)
-    return ratio.clamp(0, _LARGEST_SHARE) + _LEAST_SHARE
-
-
 def _reconcile_(parts: Sequence[_Part], target: Tensor) -> tuple[float, float]:
     """Make parts sum to the target, in place; the gap that was there and the one that is left, relative to it."""
     before = after = level = 0.0
-    for rows in bands(target.shape[0]):
+    for rows in bands(target.shape[0], _ROWS):
         wanted = target[rows].double()
         x = torch.stack([part.x[rows].double() for part in parts])
         v = torch.stack([part.variance(rows) for part in parts])

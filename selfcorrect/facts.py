@@ -163,6 +163,13 @@ class Corrected:
             lone=result.lone,
         )
 
+    def with_layers(self, name: str, others: "Mapping[str, Corrected]") -> "Corrected":
+        """Those of a frame with further view layers, by name; ``name`` is its own."""
+        if not others:
+            return self
+        layers = {layer: {**other.run(), "channels": dict(other.before.channels)} for layer, other in others.items()}
+        return replace(self, more={**self.more, "layer": name, "layers": layers})
+
     def start_line(self) -> str:
         """What a frame of a shot started from, for the log."""
         start = self.start

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +18,7 @@ from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsErro
 from selfcorrect.exr.aovs import Plan, plan
 from selfcorrect.exr.limits import check_alike
 from selfcorrect.exr.passes import Others, means, picture
+from selfcorrect.exr.view_layers import ALL, chosen, view_layers
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
 
@@ -24,9 +26,11 @@ __all__ = [
     "Images",
     "Loaded",
     "Origin",
+    "Picture",
     "Saved",
     "Sources",
     "load",
+    "load_all",
     "load_images",
     "save",
     "save_combined",
@@ -54,6 +58,47 @@ class Sources:
     denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
     aovs: str | None = None
+
+    def of_layers(self, wanted: str) -> "tuple[list[tuple[str, Sources]], list[str]]":
+        """The same files for each view layer that is to be corrected, with its name; and what the log says of others.
+
+        Args:
+            wanted: as for :func:`selfcorrect.exr.view_layers.chosen`.
+
+        Raises:
+            FileError: a file cannot be read.
+            ChannelError: a layer that is named is not in every file.
+        """
+        if "color" in (self.mapping or {}) and wanted == ALL:
+            return [("", self)], []
+        names, lines = chosen(self.a, self.b, wanted)
+        if len(names) == 1 and (wanted == ALL or "::" in self.a):
+            return [(names[0], self)], list(lines)
+        given = [path for path in (self.denoised_a, self.denoised_b, self.denoised_full) if path]
+        lacking = {
+            path: [name for name in names if name not in view_layers(path)] for path in given if "::" not in path
+        }
+        if any(lacking.values()) and len(names) > 1:
+            path, absent = next((path, absent) for path, absent in lacking.items() if absent)
+            if wanted != ALL:
+                raise ChannelError(
+                    f"{path}: expected the view layers of --layers {wanted}, but got none named {', '.join(absent)}; "
+                    "leave them out of --layers"
+                )
+            told = f"view layers {', '.join(names[1:])}: not corrected: {path} has no denoised ones"
+            return [(names[0], self._of(names[0], given=False))], [*lines, told]
+        plain = bool(lacking) and any(lacking.values())
+        return [(name, self._of(name, given=not plain)) for name in names], list(lines)
+
+    def _of(self, layer: str, *, given: bool) -> "Sources":
+        """The same files, one layer of them; ``given``: of the denoised images, too."""
+
+        def at(path: str | None) -> str | None:
+            return f"{path}::{layer}" if path and layer and given and "::" not in path else path
+
+        a, b = (f"{path}::{layer}" if layer else path for path in (self.a, self.b))
+        denoised = at(self.denoised_a), at(self.denoised_b), at(self.denoised_full)
+        return Sources(a, b, *denoised, self.mapping, self.aovs)
 
     @property
     def inputs(self) -> tuple[str | None, ...]:
@@ -113,10 +158,14 @@ class Loaded:
     Attributes:
         frame: its buffers; without denoised halves where the files hold none.
         origin: half a.
+        layer: name of its view layer, empty where there is one only.
+        others: the files' further view layers.
     """
 
     frame: Frame
     origin: Origin
+    layer: str = ""
+    others: "tuple[Loaded, ...]" = ()
 
 
 def load(sources: Sources, *, shot: bool = False) -> Loaded:
@@ -172,6 +221,13 @@ def load(sources: Sources, *, shot: bool = False) -> Loaded:
     return Loaded(frame, replace(origin, plan=_plan(origin, sources.aovs, half_a.taken)))
 
 
+def load_all(sources: Sources, layers: str, *, shot: bool = False) -> Loaded:
+    """Read a frame with all its view layers; as :func:`load` and :meth:`Sources.of_layers`, with their errors."""
+    named, _ = sources.of_layers(layers)
+    first, *others = (replace(load(own, shot=shot), layer=name) for name, own in named)
+    return replace(first, others=tuple(others))
+
+
 def _plan(origin: Origin, wanted: str | None, taken: Mapping[str, list[str]]) -> Plan:
     if wanted is None or wanted == "none":
         return Plan()
@@ -210,6 +266,22 @@ def _stamp(path: str) -> tuple[int, int, int]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
+class Picture(NamedTuple):
+    """What a further view layer of the same files becomes.
+
+    Attributes:
+        layer: its name.
+        color: full names of the channels that its colour was read from.
+        outputs: images by name, as for :func:`save`.
+        aovs: channels of its corrected AOVs by their full names.
+    """
+
+    layer: str
+    color: Sequence[str]
+    outputs: Mapping[str, Any]
+    aovs: Mapping[str, Any]
+
+
 class Saved(NamedTuple):
     """What was written: how many values lay beyond the range of half floats and were clipped, where the file holds
     those, and what became of the channels beside the colour.
@@ -227,6 +299,7 @@ def save(
     *,
     pass_through: bool = False,
     aovs: Mapping[str, Any] | None = None,
+    others: Sequence[Picture] = (),
 ) -> Saved:
     """Write a frame's outputs with all else of the halves: what is linear in the samples as the mean of both
     (:mod:`selfcorrect.exr.passes`), the rest as half a has it, bit by bit.
@@ -239,22 +312,29 @@ def save(
         attributes: name → text.
         pass_through: every channel but the picture and the AOVs that were corrected is half a's.
         aovs: channels of corrected AOVs by their full names.
+        others: further view layers; what is not their colour becomes ``LAYER.selfcorrect.NAME``.
 
     Raises:
         FileError: a half has changed since it was read, or the output cannot be written.
     """
     a, b = origin.reopened()
     shown = picture(a.channel_names, origin.taken["color"])
-    corrected, planes = dict(aovs or {}), dict[str, Any]()
-    others = Others(0, len(a.channel_names) - len(shown) - len(corrected))
-    if b is not None and not pass_through:
-        planes, others = means(a, b, but={*shown, *corrected})
-    del b
-    planes |= corrected
-    others = others._replace(corrected=len(corrected))
+    corrected, pictures = dict(aovs or {}), dict[str, Any]()
     extra = {f"selfcorrect.{name}": image for name, image in outputs.items() if name != COLOR_OUTPUT}
+    for other in others:
+        color = np.moveaxis(np.asarray(other.outputs[COLOR_OUTPUT]), -1, 0)
+        pictures |= dict(zip(picture(a.channel_names, other.color), color, strict=True))
+        corrected |= other.aovs
+        beside = {n: image for n, image in other.outputs.items() if n != COLOR_OUTPUT}
+        extra |= {f"{other.layer}.selfcorrect.{name}": image for name, image in beside.items()}
+    planes = dict[str, Any]()
+    told = Others(0, len(a.channel_names) - len(shown) - len(pictures) - len(corrected))
+    if b is not None and not pass_through:
+        planes, told = means(a, b, but={*shown, *pictures, *corrected})
+    del b
+    planes |= pictures | corrected
     clipped = exr.write(path, a, outputs[COLOR_OUTPUT], shown, attributes, extra=extra, planes=planes)
-    return Saved(clipped, others)
+    return Saved(clipped, told._replace(corrected=len(corrected)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,6 +128,34 @@ def test_a_pass_without_noise_is_kept_where_the_denoiser_would_blur_it():
     assert found.closing < 1e-6
 
 
+def test_the_gap_goes_where_halves_differ():
+    """An AOV without noise, that the denoiser leaves as it is, keeps its light; the noisy one beside it gives way."""
+    generator = torch.Generator().manual_seed(3)
+    calm = torch.full((*SIZE, 3), 0.7)
+    noisy = tuple(0.7 + 0.3 * torch.rand(*SIZE, 3, generator=generator) for _ in "ab")
+    pairs = [(calm, calm.clone()), noisy]
+    image, found, _ = corrected(pairs, 1.2)
+    assert found.gap > 0.1
+    moved = [
+        float((found.images[f"aov{i}"] - box((pair[0] + pair[1]) / 2)).abs().mean()) for i, pair in enumerate(pairs)
+    ]
+    assert moved[0] < 1e-4 * moved[1]
+    assert torch.allclose(sum(found.images.values()), image, rtol=1e-5)
+
+
+def test_the_division_is_that_of_any_exposure():
+    """What is dark is so beside the picture's mean."""
+    _, pairs = rendered()
+    found = []
+    for factor in (1.0, 2.0**-12):
+        exposed = {f"aov{i}": tuple(factor * half for half in pair) for i, pair in enumerate(pairs)}
+        frame = Frame(color=tuple(sum(pair[i] for pair in exposed.values()) for i in (0, 1))).denoise(box)
+        images = correct_aovs(1.1 * frame.denoised_full, frame, AovSum("x", exposed), denoiser_of(frame, box)).images
+        found.append({name: image / factor for name, image in images.items()})
+    for name, image in found[0].items():
+        assert torch.allclose(found[1][name], image, rtol=1e-3, atol=1e-4)
+
+
 def test_a_remainder_takes_part():
     _, pairs = rendered()
     picture = tuple(sum(pair[i] for pair in pairs) for i in (0, 1))

@@ -3,12 +3,14 @@
     .venv-blender/bin/python scripts/render/light_passes.py -o FOLDER --reference 4096
     .venv/bin/python scripts/bench/aovs.py FOLDER [FOLDER …] [--preset fast] [--threads 1]
 
-Folders hold `passes_a.exr`, `passes_b.exr` and `passes_ref.exr`. Of every AOV, what it adds to the picture (light
-times its colour) is compared: the noisy mean of the halves; denoised, each AOV by itself, as the picture is; the ratio
-method, each denoised AOV times the corrected picture over their sum; and ours, which is what `selfcorrect frame --aovs
-auto` writes. relMSE is the metric of the frames, |x - r|² / (mean_rgb(r)² + 0.01), the mean over pixels. Closing: the
-root of the mean squared difference between the sum and the picture, relative to the picture: for noisy and denoised
-that of the same kind, for the others the corrected one.
+Folders hold `passes_a.exr`, `passes_b.exr`, `passes_ref.exr`, and perhaps `passes_ref2.exr` of another seed. Of every
+AOV, what it adds to the picture (light times its colour) is compared: the noisy mean of the halves; denoised, each AOV
+by itself, as the picture is; the ratio method, each denoised AOV times the corrected picture over their sum; the
+denoised AOVs reconciled with the picture without the guard; and ours, which is what `selfcorrect frame --aovs auto`
+writes. relMSE is the metric of the frames, |x - r|² / (mean_rgb(r)² + 0.01), the mean over pixels; with two references
+(x - r)(x - r2), which does not count their noise. Closing: the root of the mean squared difference between the sum and
+the picture, relative to the picture: for noisy and denoised that of the same kind, for the others the corrected one.
+Alpha: mean squared error of half a's, of the mean of both halves and of the corrected one.
 """
 
 import argparse
@@ -23,18 +25,29 @@ from numpy.typing import NDArray
 
 import denoisers
 from selfcorrect import cli, exr, files
-from selfcorrect.aovs import denoiser_of
+from selfcorrect.aovs import denoiser_of, reconciled
 from selfcorrect.exr.aovs import Group, Halves
 from selfcorrect.exr.decompositions import radiance
 
 Image = NDArray[np.float64]
 REGRADE = {"key": 2.0, "fill": 0.5}
-METHODS = ("noisy", "denoised", "ratio", "ours")
+METHODS = ("noisy", "denoised", "ratio", "reconciled", "ours")
 
 
-def relmse(image: Image, reference: Image) -> float:
-    """Mean relative squared error of linear radiance, (H, W, 3)."""
-    return float((((image - reference) ** 2).mean(-1) / (reference.mean(-1) ** 2 + 0.01)).mean())
+def relmse(image: Image, references: list[Image]) -> float:
+    """Mean relative squared error of linear radiance, (H, W, 3), against one reference or two."""
+    squared = (image - references[0]) * (image - references[-1])
+    return float((squared.mean(-1) / (sum(references).mean(-1) ** 2 / len(references) ** 2 + 0.01)).mean())
+
+
+def reconciled_alone(halves: list[tuple[Image, Image]], denoised: list[Image], picture: Image) -> list[Image]:
+    """Denoised AOVs made to sum as `selfcorrect.aovs` does, without its guard."""
+    dark = 0.3 * float(np.sqrt(np.maximum(picture.mean(-1), 0)).mean()) ** 4
+    levels = [image.mean(-1, keepdims=True) ** 2 + dark for image in denoised]
+    spreads = [((a - b) ** 2 / level).mean() for (a, b), level in zip(halves, levels, strict=True)]
+    v = [(s + 1e-12) * level * np.ones(3) for s, level in zip(spreads, levels, strict=True)]
+    found = reconciled(*(torch.from_numpy(np.stack(planes)) for planes in (denoised, v)), torch.from_numpy(picture))
+    return list(found.numpy())
 
 
 def closing(images: list[Image], picture: Image) -> float:
@@ -52,7 +65,8 @@ def corrected(folder: Path, options: argparse.Namespace) -> exr.ExrFile:
     with tempfile.TemporaryDirectory() as away:
         out = Path(away) / "out.exr"
         command = ["frame", str(folder / "passes_a.exr"), str(folder / "passes_b.exr"), "-o", str(out)]
-        command += ["--preset", options.preset, "--threads", str(options.threads), "--aovs", "auto"]
+        alpha = ",alpha" if options.alpha else ""
+        command += ["--preset", options.preset, "--threads", str(options.threads), "--aovs", f"auto{alpha}"]
         if cli.main(command):
             raise SystemExit(1)
         return exr.read(out)
@@ -63,6 +77,7 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--alpha", action="store_true", help="also correct alpha")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     ratios: dict[str, list[float]] = {method: [] for method in METHODS}
@@ -84,9 +99,10 @@ def one_frame(folder: Path, options: argparse.Namespace, ratios: dict[str, list[
     loaded = files.load(sources)
     a, b = loaded.origin.reopened()
     assert b is not None
-    ours, reference = corrected(folder, options), exr.read(folder / "passes_ref.exr")
+    ours = corrected(folder, options)
+    references = [exr.read(path) for path in sorted(folder.glob("passes_ref*.exr"))]
     names = loaded.origin.taken["color"]
-    picture, true = color_of(ours, names), color_of(reference, names)
+    picture, true = color_of(ours, names), [color_of(reference, names) for reference in references]
     noisy_picture = (color_of(a, names) + color_of(b, names)) / 2
     denoiser = denoisers.create(denoisers.default(), threads=options.threads)
     frame = loaded.frame.denoise(denoiser)
@@ -97,33 +113,49 @@ def one_frame(folder: Path, options: argparse.Namespace, ratios: dict[str, list[
     for group in loaded.origin.plan.groups:
         start = time.perf_counter()
         halves = Halves(a, b, group.aovs)
-        denoised = [
-            np.asarray(denoise(tuple(map(torch.from_numpy, halves[x.name])))[1], np.float64) for x in group.aovs
-        ]
+        found = [denoise(tuple(torch.from_numpy(h).clamp(min=0) for h in halves[x.name])) for x in group.aovs]
+        denoised = [np.asarray(full, np.float64) for _, full in found]
+        pairs = [tuple(np.asarray(half, np.float64) for half in both) for both, _ in found]
         seconds = (time.perf_counter() - start) / len(group.aovs)
         total = np.maximum(sum(denoised), 1e-12)
         images = {
             "noisy": [(radiance(a, x) + radiance(b, x)) / 2 for x in group.aovs],
             "denoised": denoised,
             "ratio": [image * (picture / total) for image in denoised],
+            "reconciled": reconciled_alone(pairs, denoised, picture),
             "ours": [radiance(ours, x) for x in group.aovs],
         }
-        pictures = {"noisy": noisy_picture, "denoised": denoised_picture, "ratio": picture, "ours": picture}
-        table(group, images, [radiance(reference, x) for x in group.aovs], ratios)
-        print("closing: " + ", ".join(f"{name} {closing(images[name], pictures[name]):.1e}" for name in METHODS))
+        pictures = {"noisy": noisy_picture, "denoised": denoised_picture}
+        true_aovs = [[radiance(reference, x) for reference in references] for x in group.aovs]
+        table(group, images, true_aovs, ratios)
+        print(
+            "closing: "
+            + ", ".join(f"{name} {closing(images[name], pictures.get(name, picture)):.1e}" for name in METHODS)
+        )
         print(f"{seconds:.2f} s an AOV to denoise (both halves and their mean)")
-        regrade(group, images, [radiance(reference, x) for x in group.aovs])
+        regrade(group, images, true_aovs)
+    if options.alpha:
+        alpha_table(a, b, ours, references, f"{names[0].rpartition('.')[0]}.A")
+
+
+def alpha_table(a: exr.ExrFile, b: exr.ExrFile, ours: exr.ExrFile, references: list[exr.ExrFile], name: str) -> None:
+    """Mean squared error of alpha."""
+    true = [reference.pixels(name).astype(np.float64) for reference in references]
+    first, second, corrected = (file.pixels(name).astype(np.float64) for file in (a, b, ours))
+    shown = {"half a": first, "mean": (first + second) / 2, "ours": corrected}
+    told = ", ".join(f"{what} {((x - true[0]) * (x - true[-1])).mean():.3g}" for what, x in shown.items())
+    print(f"alpha: {told}; ours from {corrected.min():g} to {corrected.max():g}")
 
 
 def table(
-    group: Group, images: dict[str, list[Image]], references: list[Image], ratios: dict[str, list[float]]
+    group: Group, images: dict[str, list[Image]], references: list[list[Image]], ratios: dict[str, list[float]]
 ) -> None:
     """relMSE of each AOV, and how much less than denoised."""
     print(f"\n| {group.name} | " + " | ".join(METHODS) + " | ours / denoised |\n|---|" + "---|" * (len(METHODS) + 1))
     own: dict[str, list[float]] = {method: [] for method in METHODS}
     for i, aov in enumerate(group.aovs):
         errors = {method: relmse(images[method][i], references[i]) for method in METHODS}
-        if errors["denoised"] == 0:
+        if errors["denoised"] <= 0:
             continue  # nothing in it
         for method, error in errors.items():
             own[method].append(error / errors["denoised"])
@@ -135,12 +167,12 @@ def table(
         ratios[method] += own[method]
 
 
-def regrade(group: Group, images: dict[str, list[Image]], references: list[Image]) -> None:
+def regrade(group: Group, images: dict[str, list[Image]], references: list[list[Image]]) -> None:
     """The composite of light groups, one brighter and one darker."""
     factors = [next((f for n, f in REGRADE.items() if x.name.endswith(f"_{n}")), None) for x in group.aovs]
     if any(factor is None for factor in factors):
         return
-    wanted = sum(f * r for f, r in zip(factors, references, strict=True))
+    wanted = [sum(f * r for f, r in zip(factors, each, strict=True)) for each in zip(*references, strict=True)]
     told = ", ".join(
         f"{method} {relmse(sum(f * x for f, x in zip(factors, images[method], strict=True)), wanted):.3g}"
         for method in METHODS

@@ -58,7 +58,9 @@ SHARES = (0.72, 0.14, 0.10, 0.04)  # of the mutants, by what each command costs
 MEMORY = 1536 * 2**20  # bytes beyond what the worker takes at its start
 LIMIT = 60.0  # seconds of the processor for one mutant: on a busy machine a slow one is no hang
 STUCK = 900.0  # seconds on the clock, for what waits and works no more
-FAST = "--steps 1 --warm-steps 1 --patch 8 --batch 1 --window 3 --layers 2 --filters 2 --denoiser box --threads 1"
+FAST = (
+    "--steps 1 --warm-steps 1 --patch 8 --batch 1 --window 3 --network-layers 2 --filters 2 --denoiser box --threads 1"
+)
 ODD = (0, 1, 2, 3, 7, 255, 2**15, 2**16, 2**24, 2**31 - 1, -1, -2, -(2**31))
 FLOATS = (0.0, -1.0, 1e-45, 1e-30, 65504.0, 1e30, 3e38, float("nan"), float("inf"), float("-inf"))
 TYPES = (

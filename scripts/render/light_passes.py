@@ -1,10 +1,14 @@
-"""A small frame with every kind of light pass, for `scripts/bench/aovs.py`: two halves and a reference, with Cycles.
+"""Small frames with every kind of light pass, for `scripts/bench/aovs.py`: two halves and a reference, with Cycles.
 
     .venv-blender/bin/python scripts/render/light_passes.py -o FOLDER [--spp 64] [--reference 2048] [--size 240x160]
 
-A diffuse room with a patterned floor, a rough metal and a mirror ball, a glass ball, a lamp to look at, a thin fog
-beneath a lamp, and an opening through which the world is seen. Every light is in one of two groups, ``key`` and
-``fill``, so both decompositions of the picture are whole: the light passes with their colours, and the groups.
+`--scene still-life`, of three cameras: a diffuse room with a patterned floor, a rough metal and a mirror ball, a glass
+ball, a lamp to look at, a thin fog beneath a lamp, and an opening through which the world is seen. Every light is in
+one of two groups, ``key`` and ``fill``, so both decompositions of the picture are whole: the light passes with their
+colours, and the groups.
+
+`--scene tufts`: blades of grass before nothing, so that alpha is noisy where they and the defocus blur end, around a
+wax ball (subsurface scattering), a copper one and a lamp, with the same two groups.
 
 Nothing is loaded; the scene is made by code. The halves are set up by `render_blender.py`, with seeds of their own and
 of the reference's.
@@ -13,6 +17,7 @@ of the reference's.
 import argparse
 import math
 import os
+import random
 import sys
 import time
 from pathlib import Path
@@ -92,8 +97,8 @@ def lamp(name: str, group: str, kind: str, energy: float, place: tuple[float, ..
     bpy.context.scene.collection.objects.link(held)
 
 
-def still_life(view: int = 0) -> bpy.types.Scene:
-    """The scene, with its passes on."""
+def empty() -> bpy.types.Scene:
+    """A scene with its passes on and nothing in it."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
@@ -105,7 +110,38 @@ def still_life(view: int = 0) -> bpy.types.Scene:
     layer.cycles.use_pass_volume_direct = layer.cycles.use_pass_volume_indirect = True
     for group in GROUPS:
         layer.lightgroups.add(name=group)
+    return scene
 
+
+def sky(scene: bpy.types.Scene, color: tuple[float, ...], strength: float) -> None:
+    """A world of one colour, in the group ``fill``."""
+    world = bpy.data.worlds.new("world")
+    world.use_nodes = True
+    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
+    background.inputs["Color"].default_value = color
+    background.inputs["Strength"].default_value = strength
+    world.lightgroup = "fill"
+    scene.world = world
+
+
+def look(scene: bpy.types.Scene, place: tuple[float, ...], aim: tuple[float, ...], lens: float) -> bpy.types.Camera:
+    """The scene's camera, here and turned to there."""
+    data = bpy.data.cameras.new("camera")
+    data.lens = lens
+    camera = bpy.data.objects.new("camera", data)
+    camera.location = place
+    turned = camera.constraints.new("TRACK_TO")
+    turned.target, turned.track_axis, turned.up_axis = bpy.data.objects.new("aim", None), "TRACK_NEGATIVE_Z", "UP_Y"
+    turned.target.location = aim
+    for placed in (camera, turned.target):
+        scene.collection.objects.link(placed)
+    scene.camera = camera
+    return data
+
+
+def still_life(view: int = 0) -> bpy.types.Scene:
+    """The scene, with its passes on."""
+    scene = empty()
     floor = add("plane", checkered("tiles"), size=8)
     floor.name = "floor"
     wall = material("wall", "BsdfDiffuse", Color=(0.55, 0.6, 0.5, 1))
@@ -126,25 +162,44 @@ def still_life(view: int = 0) -> bpy.types.Scene:
 
     lamp("key", "key", "AREA", 180.0, (3.2, -2.2, 3.6), size=0.6, color=(1.0, 0.85, 0.7))
     lamp("spot", "fill", "SPOT", 220.0, (2.4, 1.0, 3.2), spot_size=math.radians(40), shadow_soft_size=0.1)
-    world = bpy.data.worlds.new("world")
-    world.use_nodes = True
-    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
-    background.inputs["Color"].default_value = (0.25, 0.4, 0.7, 1)
-    background.inputs["Strength"].default_value = 0.35
-    world.lightgroup = "fill"
-    scene.world = world
-
-    data = bpy.data.cameras.new("camera")
-    data.lens = 32
-    camera = bpy.data.objects.new("camera", data)
-    camera.location, aim = VIEWS[view]
-    look = camera.constraints.new("TRACK_TO")
-    look.target, look.track_axis, look.up_axis = bpy.data.objects.new("aim", None), "TRACK_NEGATIVE_Z", "UP_Y"
-    look.target.location = aim
-    for placed in (camera, look.target):
-        scene.collection.objects.link(placed)
-    scene.camera = camera
+    sky(scene, (0.25, 0.4, 0.7, 1), 0.35)
+    look(scene, *VIEWS[view], lens=32)
     return scene
+
+
+def tufts(view: int = 0) -> bpy.types.Scene:
+    """Grass, wax, copper and a lamp before nothing, out of focus at the front and the back."""
+    scene = empty()
+    scene.render.film_transparent = True
+    floor = add("plane", material("soil", "BsdfDiffuse", Color=(0.2, 0.13, 0.08, 1)), size=3)
+    floor.name = "floor"
+    chance = random.Random(0)
+    vertices, faces = [], []
+    for _ in range(1500):
+        x, y, angle = chance.uniform(-1.5, 1.5), chance.uniform(-1.5, 1.5), chance.uniform(0, 2 * math.pi)
+        height, lean, wide = chance.uniform(0.25, 0.8), chance.uniform(0.0, 0.3), 0.012
+        across = (wide * math.cos(angle), wide * math.sin(angle))
+        tip = (x - lean * math.sin(angle), y + lean * math.cos(angle), height)
+        faces.append(tuple(range(len(vertices), len(vertices) + 3)))
+        vertices += [(x - across[0], y - across[1], 0.0), (x + across[0], y + across[1], 0.0), tip]
+    blades = bpy.data.meshes.new("blades")
+    blades.from_pydata(vertices, [], faces)
+    blades.materials.append(material("grass", "BsdfDiffuse", Color=(0.2, 0.45, 0.08, 1)))
+    scene.collection.objects.link(bpy.data.objects.new("blades", blades))
+    wax = material("wax", "SubsurfaceScattering", Color=(0.8, 0.5, 0.35, 1), Scale=0.15)
+    copper = material("copper", "BsdfGlossy", Color=(0.95, 0.5, 0.35, 1), Roughness=0.15)
+    bulb = material("bulb", "Emission", Color=(1.0, 0.6, 0.3, 1), Strength=5.0)
+    add("uv_sphere", wax, radius=0.4, location=(-0.5, 0.0, 0.7), segments=48, ring_count=24)
+    add("uv_sphere", copper, radius=0.35, location=(0.55, 0.3, 0.75), segments=48, ring_count=24)
+    add("uv_sphere", bulb, radius=0.1, location=(0.05, -0.6, 0.5)).lightgroup = "fill"
+    lamp("key", "key", "AREA", 120.0, (2.5, -2.5, 3.0), size=0.4, color=(1.0, 0.9, 0.8))
+    sky(scene, (0.4, 0.5, 0.7, 1), 0.5)
+    camera = look(scene, (0.3, -3.6, 1.2), (0.0, 0.0, 0.55), lens=45)
+    camera.dof.use_dof, camera.dof.focus_distance, camera.dof.aperture_fstop = True, 3.5, 0.5
+    return scene
+
+
+SCENES = {"still-life": still_life, "tufts": tufts}
 
 
 def main() -> None:
@@ -153,11 +208,12 @@ def main() -> None:
     parser.add_argument("--spp", type=even, default=64, metavar="N", help="of both halves together (default: 64)")
     parser.add_argument("--reference", type=int, default=2048, metavar="N", help="samples of the reference; 0: none")
     parser.add_argument("--size", type=size, default=(240, 160), metavar="WxH")
-    parser.add_argument("--view", type=int, default=0, choices=range(len(VIEWS)), help="of the camera")
+    parser.add_argument("--scene", default="still-life", choices=SCENES)
+    parser.add_argument("--view", type=int, default=0, choices=range(len(VIEWS)), help="camera of still-life")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0, help="of Cycles; 0: all")
     options = parser.parse_args(sys.argv[1:])
-    scene = still_life(options.view)
+    scene = SCENES[options.scene](options.view)
     if options.threads:
         scene.render.threads_mode, scene.render.threads = "FIXED", options.threads
     jobs = [(half, options.spp // 2) for half in HALVES]

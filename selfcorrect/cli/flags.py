@@ -10,6 +10,7 @@ from typing import Any
 import denoisers
 from selfcorrect.cli.help import Expert, add_help_all
 from selfcorrect.errors import FileError, SettingsError
+from selfcorrect.exr.view_layers import ALL
 from selfcorrect.settings import Settings, seconds
 from selfcorrect.stages import STAGES
 from selfcorrect.stages.stage import Extra
@@ -17,6 +18,7 @@ from selfcorrect.stages.stage import Extra
 __all__ = [
     "add_aovs",
     "add_extra",
+    "add_layers",
     "add_maxmem",
     "add_preset",
     "add_run_flags",
@@ -27,6 +29,9 @@ __all__ = [
     "settings_of",
 ]
 
+_FLAGS = {"layers": "--network-layers"}
+"""Of settings whose own name means another thing on the command line: --layers are those of the files."""
+
 
 def add_aovs(parser: argparse.ArgumentParser) -> None:
     """The AOVs to correct."""
@@ -36,6 +41,17 @@ def add_aovs(parser: argparse.ArgumentParser) -> None:
         metavar="auto|NAME,NAME|none",
         help="correct these AOVs so that they sum to the corrected picture; auto: every set of light passes or light "
         "groups that sums to it in the render; alpha among the names: also that",
+    )
+
+
+def add_layers(parser: argparse.ArgumentParser) -> None:
+    """The view layers to correct."""
+    parser.add_argument(
+        "--layers",
+        dest="view_layers",
+        default=ALL,
+        metavar="NAME,NAME",
+        help="view layers, or views, to correct; by default all of the files'",
     )
 
 
@@ -107,7 +123,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
             how = {"type": seconds, "metavar": "10s"} if f.metadata["unit"] == "s" else {"metavar": "FILE"}
         if isinstance(f.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
-        parser.add_argument(_flag(f.name), default=None, help=shown(f.metadata["help"]), **how)
+        parser.add_argument(_flag(f.name), dest=f.name, default=None, help=shown(f.metadata["help"]), **how)
 
 
 def settings_of(options: argparse.Namespace) -> Settings:
@@ -153,7 +169,7 @@ def _from_file(path: str | None) -> dict[str, Any]:
 
 
 def _flag(setting: str) -> str:
-    return f"--{setting.replace('_', '-')}"
+    return _FLAGS.get(setting, f"--{setting.replace('_', '-')}")
 
 
 def mapping(options: argparse.Namespace) -> dict[str, str]:

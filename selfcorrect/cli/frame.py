@@ -3,12 +3,15 @@
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from selfcorrect import exr, files
 from selfcorrect.cli import flags, halves, memory, pages
-from selfcorrect.cli.runner import Runner
-from selfcorrect.cli.terminal import EndOnInterrupt, answer
+from selfcorrect.cli.runner import Corrected, Runner
+from selfcorrect.cli.terminal import EndOnInterrupt, answer, log
+from selfcorrect.errors import SettingsError
+from selfcorrect.exr.view_layers import ALL
 from selfcorrect.facts import Written
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
@@ -25,6 +28,7 @@ def add(commands: Any) -> None:
     flags.add_maxmem(parser)
     pages.add_flag(parser)
     flags.add_aovs(parser)
+    flags.add_layers(parser)
     flags.add_run_flags(parser)
     parser.set_defaults(run=_frame)
 
@@ -55,12 +59,26 @@ def correct_files(
     """Correct one frame from files to file; ``show`` is called with the denoised frame, ``gather`` with it and the
     result.
     """
-    start = time.perf_counter()
+    layers, told = sources.of_layers(getattr(options, "view_layers", ALL))
+    log(*told)
     extra = sum(len(paths) for paths in flags.extra_files(options, flags.settings_of(options)).values())
-    scratch = memory.fitted(options, maxmem, sources, extra=extra)
-    runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch)
+    if extra and len(layers) > 1:
+        raise SettingsError(
+            f"{sources.a}: expected one view layer, FILE.exr::LAYER, beside images of a stage, but got {len(layers)}"
+        )
+    scratch = memory.fitted(options, maxmem, layers[0][1], extra=extra, layers=len(layers))
+    runner = Runner(options, given=sources.denoised_a is not None, scratch=scratch, layers=len(layers))
     remove_abandoned(exr.check_target(output).parent)
+    done = list[Corrected]()
     with EndOnInterrupt() as stop:
-        denoised = runner.denoise(files.load(sources), start)
-        corrected = runner.correct(denoised, show=show, stop=stop, gather=gather)
-        return runner.write(output, corrected)
+        for layer, own in layers:  # one after the other: only what they become is kept
+            start = time.perf_counter()
+            loaded = replace(files.load(own), layer=layer)
+            denoised = runner.denoise(loaded, start)
+            del loaded
+            first = not done
+            done.append(
+                runner.correct(denoised, show=show if first else None, stop=stop, gather=gather if first else None)
+            )
+            del denoised
+        return runner.write(output, done[0], done[1:])

@@ -56,7 +56,7 @@ _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
 class Needs(NamedTuple):
-    """Peak bytes of each stage; that of denoising without what OIDN takes beside its images."""
+    """Peak bytes of each stage; those of denoising and of AOVs without what OIDN takes beside its images."""
 
     read: float
     denoise: float
@@ -77,7 +77,9 @@ def parse_size(text: str) -> int:
     return int(float(found[1]) * _UNITS[found[2].upper()])
 
 
-def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False) -> int:
+def scratch_within(
+    limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False, layers: int = 1
+) -> int:
     """Bytes that are left for OIDN beside its images.
 
     Args:
@@ -86,13 +88,14 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
         settings: of the correction.
         extra: how many images stages need beyond the halves.
         shot: it is one of a shot's, with its neighbours.
+        layers: how many view layers are corrected.
 
     Raises:
         FileError: a file cannot be read.
         FrameError: a file has another size than half a.
         SettingsError: the frame does not fit.
     """
-    found = needs(sources, settings, extra=extra, shot=shot)
+    found = needs(sources, settings, extra=extra, shot=shot, layers=layers)
     needed = _with_denoiser(found)
     stage = max(needed, key=lambda name: needed[name])
     if needed[stage] > limit:
@@ -100,11 +103,17 @@ def scratch_within(limit: int, sources: Sources, settings: Settings, *, extra: i
             f"{sources.a}: expected --maxmem of at least {rounded(needed[stage])} for a frame of this size and these "
             f"channels (most of it to {stage}), but got {limit / GIB:.1f}G"
         )
-    return int(limit - found.denoise - _OIDN)
+    return int(limit - max(found.denoise, found.aovs) - _OIDN)
 
 
 def fitted(
-    options: argparse.Namespace, maxmem: str | None, sources: Sources, *, extra: int = 0, shot: bool = False
+    options: argparse.Namespace,
+    maxmem: str | None,
+    sources: Sources,
+    *,
+    extra: int = 0,
+    shot: bool = False,
+    layers: int = 1,
 ) -> int | None:
     """Change the settings in ``options`` to what there is room for, and tell of it.
 
@@ -114,21 +123,23 @@ def fitted(
     if maxmem is None:
         return None
     limit = parse_size(maxmem)
-    changes, lines = reduced(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
+    changes, lines = reduced(limit, sources, flags.settings_of(options), extra=extra, shot=shot, layers=layers)
     for name, value in changes.items():
         setattr(options, name, value)
     for line in lines:
         log(line)
-    return scratch_within(limit, sources, flags.settings_of(options), extra=extra, shot=shot)
+    return scratch_within(limit, sources, flags.settings_of(options), extra=extra, shot=shot, layers=layers)
 
 
-def fits(limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False) -> bool:
+def fits(
+    limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False, layers: int = 1
+) -> bool:
     """Whether a frame can be corrected within so many bytes; arguments as for :func:`scratch_within`."""
-    return max(_with_denoiser(needs(sources, settings, extra=extra, shot=shot)).values()) <= limit
+    return max(_with_denoiser(needs(sources, settings, extra=extra, shot=shot, layers=layers)).values()) <= limit
 
 
 def reduced(
-    limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False
+    limit: int, sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False, layers: int = 1
 ) -> tuple[dict[str, Any], list[str]]:
     """What has to change in the settings for a frame to fit, if that is enough, and a line of each.
 
@@ -139,7 +150,7 @@ def reduced(
         steps.append({"candidates": "none"})
     if shot:
         steps += [{**steps[-1], "frame_radius": radius} for radius in reversed(range(settings.frame_radius))]
-    fitting = (s for s in steps if fits(limit, sources, replace(settings, **s), extra=extra, shot=shot))
+    fitting = (s for s in steps if fits(limit, sources, replace(settings, **s), extra=extra, shot=shot, layers=layers))
     changes = next(fitting, steps[-1])
     lines = {
         "candidates": "no further candidates: --maxmem has no room for them",
@@ -149,13 +160,15 @@ def reduced(
 
 
 def _with_denoiser(found: Needs) -> dict[str, float]:
-    return dict(found._asdict(), denoise=found.denoise + _OIDN + _LEAST_SCRATCH)
+    least = _OIDN + _LEAST_SCRATCH
+    return dict(found._asdict(), denoise=found.denoise + least, aovs=found.aovs + least if found.aovs else 0.0)
 
 
-def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False) -> Needs:
+def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = False, layers: int = 1) -> Needs:
     """What a frame needs, by the headers of all its files.
 
     ``extra`` images beyond the halves are held as they are and denoised. In a ``shot`` neighbours are held beside it.
+    What becomes of each of its view ``layers`` is held until all are written; of a shot, all that is held of one.
     """
     check_alike(sources.paths)
     file, _, layer = sources.a.partition("::")
@@ -181,22 +194,29 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = 
         if settings.frame_radius and settings.guard:
             kept = 2 * half + 6 * image + 3 * aids + _MOTIONS * pixels  # also what was gathered and denoised again
             around += (2 * settings.frame_radius + 2) * kept + 3 * image
+        around *= layers
+    around += (layers - 1) * (image + (held if _corrects(sources) else 0))
     both, base = 2 * half, BASE + around
     correct = both + 3 * image + max(training, image + evidence) + 2 * beyond + candidates
     return Needs(
         read=base + half + held + max(stored, half) + beyond,
         denoise=base + both + max(image + aids, 2 * image) + image + 2 * beyond + candidates,
         correct=base + _WORK + correct,
-        aovs=around + _of_aovs(pixels, stored_channels, half, held) if sources.aovs not in (None, "none") else 0.0,
+        aovs=around + _of_aovs(pixels, stored_channels, half, held) if _corrects(sources) else 0.0,
         write=base + _WORK + 2 * image + 2 * held + max(stored, held),  # both halves, and what is made of them
     )
 
 
+def _corrects(sources: Sources) -> bool:
+    """Whether AOVs are."""
+    return sources.aovs not in (None, "none")
+
+
 def _of_aovs(pixels: int, count: int, half: float, held: float) -> float:
-    """At most every channel is of an AOV, each of which is kept as a whole and as half floats of both halves."""
+    """At most every channel is of an AOV, each of which is kept in float32, with where it has light, and as written."""
     image = pixels * _RGB
-    kept = 2 * image * (count / 3)
-    working = 12 * image  # denoised halves and their mean, the gaps and sums, the guides of each, one AOV's evidence
+    kept = 1.25 * image * (count / 3) + held
+    working = 12 * image  # denoised halves and their mean, the guides of each, one AOV's evidence
     return BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
 
 

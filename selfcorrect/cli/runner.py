@@ -2,7 +2,7 @@
 
 import argparse
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,6 +41,7 @@ class Denoised:
         extra: by name of a stage, what that needs beyond the halves.
         facts: what is known of it.
         began: when the work on it began, by ``time.perf_counter``.
+        layer: name of its view layer, where the files have several.
     """
 
     frame: Frame
@@ -48,6 +49,7 @@ class Denoised:
     extra: dict[str, Images]
     facts: facts.Denoised
     began: float
+    layer: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,7 @@ class Corrected:
         network: for the next frame to start from.
         facts: what is known of it.
         began: when the work on it began, by ``time.perf_counter``.
+        layer: name of its view layer, where the files have several.
     """
 
     origin: files.Origin
@@ -69,6 +72,7 @@ class Corrected:
     network: Network | None
     facts: facts.Corrected
     began: float
+    layer: str = ""
 
 
 class Runner:
@@ -78,31 +82,36 @@ class Runner:
         options: what the flags of :func:`selfcorrect.cli.flags.add_run_flags` gave.
         given: denoised halves are given, so that no denoiser is needed.
         scratch: bytes that the denoiser may take beside its images, where it can be told.
+        layers: how many view layers a frame has that share its time budget.
 
     Raises:
         SelfcorrectError: settings, device or denoiser are not to be had.
     """
 
-    def __init__(self, options: argparse.Namespace, *, given: bool, scratch: int | None = None):
+    def __init__(self, options: argparse.Namespace, *, given: bool, scratch: int | None = None, layers: int = 1):
+        self.layers = layers
         self.settings = flags.settings_of(options)
         if options.diagnostics and not self.settings.guard:
             named = ",".join(options.diagnostics)
             raise SettingsError(f"expected the guard with --diagnostics {named}, but got settings that turn it off")
         self._stages = stages.opened(self.settings)
         self._extra_files = flags.extra_files(options, self.settings)
-        wanted = getattr(options, "aovs", None) or "none"
-        if wanted != "none" and given and options.denoiser is None:
-            raise SettingsError(f"expected --denoiser NAME with --aovs {wanted}, which are denoised too, but got none")
         if given and options.denoiser is None:
             self._check_denoiser(" which have to be denoised too,")
         _use_machine(options)
         self._options = options
-        self._told: dict[str, list[str]] = {}
+        self._told: dict[str, dict[str, list[str]]] = {}
         self._denoise = None
+        self._aovs_denoise: Callable[..., Any] | None = None
         if options.denoiser is not None or not given:
             self._denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
             if options.denoiser is None and denoisers.fallback():
                 log(denoisers.fallback())
+        if (getattr(options, "aovs", None) or "none") != "none":
+            self._aovs_denoise = self._denoise
+            if self._aovs_denoise is None:
+                self._aovs_denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
+                log(f"AOVs: denoised by {self._spec}: --denoised-a and --denoised-b are of the picture alone")
         self._further = {}
         if self._denoise is not None and self.settings.guard and self.settings.candidates != "none":
             self._further = {
@@ -175,15 +184,15 @@ class Runner:
         aovs, about = self._aovs(origin, frame, result)
         corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, {**(more or {}), **about})
         outputs = _outputs(result, self._options.diagnostics)
-        return Corrected(origin, outputs, aovs, result.network, corrected, began)
+        return Corrected(origin, outputs, aovs, result.network, corrected, began, denoised.layer)
 
     def _aovs(self, origin: files.Origin, frame: Frame, result: Result) -> tuple[dict[str, Any], dict[str, Any]]:
         """Channels of the AOVs that the user wants corrected, and what is to be told of them."""
         if not origin.plan.written:
             return {}, {}
-        assert self._denoise is not None  # checked before the frame was read
+        assert self._aovs_denoise is not None  # there would be no plan
         start = time.perf_counter()
-        denoise = denoiser_of(frame, self._denoise)
+        denoise = denoiser_of(frame, self._aovs_denoise)
         a, b = origin.reopened()
         assert b is not None  # there would be no plan
         through = self._options.pass_through
@@ -206,8 +215,6 @@ class Runner:
             for name, paths in self._extra_files.items()
         }
         seconds = {"read": time.perf_counter() - began}
-        if loaded.origin.plan.written and self._denoise is None:
-            raise SettingsError("expected --denoiser NAME with --aovs, which are denoised too, but got none")
         denoiser = "given"
         if frame.denoised is None or self._options.denoiser is not None:  # who is named beats files found beside
             denoiser, start = self.denoiser, time.perf_counter()
@@ -219,14 +226,16 @@ class Runner:
             self._check_denoiser(" as the halves' files hold denoised images and those of both must be alike,")
         repairs = {name: counts for images in extra.values() for name, counts in images.repairs.items()}
         known = facts.Denoised.of(frame, denoiser, channels, seconds, repairs)
-        return Denoised(frame, loaded.origin, extra, known, began)
+        return Denoised(frame, loaded.origin, extra, known, began, loaded.layer)
 
     def prepare(self, denoised: Denoised) -> Denoised:
         """The frame with further candidates, where they are worth it; and tell of all that is known of it."""
         frame, known, begun = denoised.frame, denoised.facts, time.perf_counter()
-        if known.channels != self._told:  # of a shot, only where it changes
+        if self.layers > 1:
+            log(f"view layer {denoised.layer or '(none)'}")
+        if known.channels != self._told.get(denoised.layer):  # of a shot, only where it changes
             log(*facts.channel_lines(known.channels))
-        self._told = dict(known.channels)
+        self._told[denoised.layer] = dict(known.channels)
         for line in denoised.origin.plan.lines:
             log(line)
         for warning in (*denoised.origin.lost, *doubts(frame)):
@@ -239,20 +248,22 @@ class Runner:
             log(line)
         return replace(denoised, frame=frame, facts=known)
 
-    def write(self, output: str, corrected: Corrected) -> facts.Written:
-        """Write a frame, and tell of it."""
+    def write(self, output: str, corrected: Corrected, others: Sequence[Corrected] = ()) -> facts.Written:
+        """Write a frame with its further view layers, and tell of it."""
         start = time.perf_counter()
+        known = corrected.facts.with_layers(corrected.layer, {other.layer: other.facts for other in others})
         saved = files.save(
             output,
             corrected.origin,
             corrected.outputs,
-            corrected.facts.attributes(),
+            known.attributes(),
             pass_through=self._options.pass_through,
             aovs=corrected.aovs,
+            others=[files.Picture(o.layer, o.origin.taken["color"], o.outputs, o.aovs) for o in others],
         )
         now = time.perf_counter()
         seconds = {"write": now - start, "total": now - corrected.began}
-        written = facts.Written(output, saved.clipped, saved.others, seconds, corrected.facts)
+        written = facts.Written(output, saved.clipped, saved.others, seconds, known)
         log(*written.lines())  # in one piece: another frame may be in work meanwhile
         return written
 
@@ -262,7 +273,7 @@ class Runner:
             return self.settings
         writing = _WRITE_SECONDS * frame.size[0] * frame.size[1]
         # a budget that is spent already must not turn into none
-        return replace(self.settings, time_budget=max(self.settings.time_budget - spent - writing, 1e-9))
+        return replace(self.settings, time_budget=max(self.settings.time_budget / self.layers - spent - writing, 1e-9))
 
     def _check_denoiser(self, why: str) -> None:
         """Raise where no denoiser is named and a stage's images have to be denoised."""

@@ -2,17 +2,19 @@
 
 import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from selfcorrect import files
 from selfcorrect.cli import flags, memory, pages
-from selfcorrect.cli.runner import Denoised, Runner
+from selfcorrect.cli.runner import Corrected, Denoised, Runner
 from selfcorrect.cli.terminal import answer, log
-from selfcorrect.errors import FileError, FrameError, SelfcorrectError
+from selfcorrect.errors import ChannelError, FileError, FrameError, SelfcorrectError
 from selfcorrect.settings import Settings
 from selfcorrect.shot import run as shot
+from selfcorrect.shot.chain import Chain
 from selfcorrect.shot.framerange import parse_frames
 from selfcorrect.shot.state import load_state
 from selfcorrect.stages.core.network import Network
@@ -42,6 +44,7 @@ def add(commands: Any) -> None:
     flags.add_maxmem(parser)
     pages.add_flag(parser)
     flags.add_aovs(parser)
+    flags.add_layers(parser)
     flags.add_run_flags(parser)
     parser.set_defaults(run=_sequence)
 
@@ -57,11 +60,14 @@ def _sequence(options: argparse.Namespace) -> int:
         **flags.denoised(options),
         mapping=flags.mapping(options),
         aovs=options.aovs,
+        layers=options.view_layers,
     )
     page = pages.ShotPage.at(options.report, frames)
-    scratch = memory.fitted(options, options.maxmem, work.sources(frames[0]), shot=True)  # all are like the first
-    runner = Runner(options, given=options.denoised_a is not None, scratch=scratch)
+    layers = _layers(work, frames)
+    scratch = memory.fitted(options, options.maxmem, work.sources(frames[0]), shot=True, layers=layers)
+    runner = Runner(options, given=options.denoised_a is not None, scratch=scratch, layers=layers)
     around = _Around(runner)
+    further = _Further(runner, cold=options.cold)
     how = shot.Options(
         runner.settings,
         {
@@ -69,6 +75,7 @@ def _sequence(options: argparse.Namespace) -> int:
             "diagnostics": options.diagnostics,
             "pass through": options.pass_through,
             "aovs": options.aovs,
+            "view layers": options.view_layers,
         },
         skip_existing=options.skip_existing,
         cold=options.cold,
@@ -83,9 +90,11 @@ def _sequence(options: argparse.Namespace) -> int:
         gather = None if page is None else page.gather(job.frame)
         corrected = runner.correct(around.denoised(job), job.link.network, job.meanwhile, gather=gather, more=more)
         log(f"frame {job.frame}: {corrected.facts.start_line()}")
-        return shot.Done(corrected.network, partial(runner.write, job.output, corrected))  # the frame is let go
+        others = further.corrected(job)
+        return shot.Done(corrected.network, partial(runner.write, job.output, corrected, others))  # the frame is let go
 
     def report(outcome: shot.Outcome) -> None:
+        further.told(outcome)
         if page is not None:
             page.told(outcome)
         if outcome.kind != "written":
@@ -107,6 +116,16 @@ def _sequence(options: argparse.Namespace) -> int:
     if failed:
         log(f"selfcorrect: {failed} of {len(frames)} frames failed")
     return failed
+
+
+def _layers(work: shot.Shot, frames: Sequence[int]) -> int:
+    """How many view layers are corrected of the first frame, like which all are; what is wrong with it, it tells."""
+    try:
+        layers, lines = work.sources(frames[0]).of_layers(work.layers)
+    except (FileError, ChannelError):
+        return 1
+    log(*lines)
+    return len(layers)
 
 
 class _Around:
@@ -148,6 +167,40 @@ class _Around:
             return self._runner.denoise(loaded, keep_aids=True)
         except SelfcorrectError as error:
             return error
+
+
+class _Further:
+    """The further view layers of a shot's files, each a shot of its own: neighbours, and networks that are handed on.
+
+    A state on disk is that of the first layer alone: after frames that were left out, the others start cold.
+    """
+
+    def __init__(self, runner: Runner, *, cold: bool):
+        self._runner = runner
+        self._cold = cold
+        self._shots: dict[str, tuple[_Around, Chain]] = {}
+
+    def corrected(self, job: shot.Job) -> list[Corrected]:
+        """The further layers of a job's frame."""
+        found = []
+        for loaded in job.loaded.others:
+            layer = loaded.layer
+            around, chain = self._shots.setdefault(layer, (_Around(self._runner), Chain(cold=self._cold)))
+            beside = {n: one for n, read in job.around.items() for one in read.others if one.layer == layer}
+            absent = {n: f"no view layer {layer}" for n in job.around.keys() - beside.keys()}
+            link = chain.link(loaded.frame)
+            own = job._replace(loaded=loaded, link=link, around=beside, missing={**job.missing, **absent})
+            corrected = self._runner.correct(around.denoised(own), link.network, job.meanwhile)
+            log(f"frame {job.frame}, view layer {layer}: {corrected.facts.start_line()}")
+            chain.corrected(corrected.network)
+            found.append(corrected)
+        return found
+
+    def told(self, outcome: shot.Outcome) -> None:
+        """What became of a frame."""
+        if outcome.kind == "skipped":
+            for _, chain in self._shots.values():
+                chain.left_out(f"frame {outcome.frame}", None)
 
 
 def _given(path: str, settings: Settings) -> Network:

@@ -141,6 +141,8 @@ def _sums(a: ExrFile, b: ExrFile, color: Sequence[str]) -> tuple[list[Group], li
     found, lines = list[Group](), list[str]()
     proposed = [one for one in candidates(a.channel_names, color) if _in_both(a, b, one)]
     for one in proposed:
+        if any(set(one.aovs) <= set(group.aovs) for group in found):
+            continue  # what that set has beyond these is 0
         closing = tuple(closing_error(half, color, one.aovs) for half in (a, b))
         if max(closing) <= max(tolerance(half, color, one.aovs) for half in (a, b)):
             found.append(_group(one, closing))

@@ -26,6 +26,9 @@ _BLENDER_PLAIN = (
     "Emit",
     "Env",
 )
+_WORLD = ("environment", "env")
+"""Blender has the world in these, and in its light group, also where the film is transparent and the picture not."""
+
 _LOBES = ("diffuse", "specular", "coat", "sheen", "transmission", "sss", "volume")
 _PLAIN = ("emission", "background")
 _GROUPED = ("Combined", "RGBA", "Ci", "C", "Beauty")
@@ -73,7 +76,14 @@ def candidates(names: Sequence[str], color: Sequence[str]) -> list[Decomposition
         return tuple(_aov(name, there[name], colors) for name in dict.fromkeys(own))
 
     lights = [light for _, pair in DIVIDED for light in pair]
-    found = [Decomposition("Blender's light passes", aovs([*lights, *_BLENDER_PLAIN]))]
+    blender = aovs([*lights, *_BLENDER_PLAIN])
+    found = [
+        Decomposition("Blender's light passes", blender),
+        Decomposition(
+            "Blender's light passes before a transparent film",
+            tuple(aov for aov in blender if aov.name.casefold() not in _WORLD),
+        ),
+    ]
     found += [
         Decomposition(f"light groups {picture}_…", aovs([name for name in there if _in_group(name, picture)]))
         for picture in _GROUPED

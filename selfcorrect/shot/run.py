@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 from selfcorrect import exr, files
 from selfcorrect.errors import FileError, SelfcorrectError, out_of_memory
 from selfcorrect.exr.file import one_line
+from selfcorrect.exr.view_layers import ALL
 from selfcorrect.publish import remove_abandoned
 from selfcorrect.settings import Settings
 from selfcorrect.shot.chain import Chain, Link
@@ -41,6 +42,7 @@ class Shot:
         denoised_full: denoised mean of both halves.
         mapping: role → channel.
         aovs: which AOVs are corrected.
+        layers: which view layers are, as for :meth:`selfcorrect.files.Sources.of_layers`.
     """
 
     a: str
@@ -52,6 +54,7 @@ class Shot:
     denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
     aovs: str | None = None
+    layers: str = ALL
 
     def sources(self, frame: int) -> files.Sources:
         """The files of one frame.
@@ -277,7 +280,7 @@ class _Run:
     def _load(self, frame: int) -> files.Loaded | Exception:
         """In the reader's thread. What is wrong with a file is for the frames that need it to tell."""
         try:
-            return files.load(self.shot.sources(frame), shot=self.options.reach > 0)
+            return files.load_all(self.shot.sources(frame), self.shot.layers, shot=self.options.reach > 0)
         except Exception as error:
             return error
 

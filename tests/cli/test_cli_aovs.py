@@ -8,6 +8,7 @@ import pytest
 from helpers.commands import BALANCED, call, refused
 from helpers.exr_files import save, three
 
+import denoisers
 from selfcorrect import exr
 
 SIZE = (24, 30)
@@ -152,9 +153,24 @@ def test_refusals_before_any_work(halves: list[Path], tmp_path: Path) -> None:
     assert "expected an AOV 'nothing' with R, G, B beside the colour" in refused(*command, "--aovs", "nothing")
     told = refused(*command, "--aovs", "only_a")
     assert "b.exr: expected the AOV 'only_a' like" in told
-    given = ("frame", *halves, "-o", out, "--denoised-a", halves[0], "--denoised-b", halves[1])
-    assert "expected --denoiser NAME with --aovs auto" in refused(*given, "--aovs", "auto")
     assert not out.exists()
+
+
+def test_aovs_beside_denoised_halves_are_denoised_by_the_usual_denoiser(halves: list[Path], tmp_path: Path) -> None:
+    """The picture is what was given; the AOVs sum to what is made of that."""
+    denoised = [
+        save(tmp_path / f"d{half.name}", {letter: np.full(SIZE, 1.5, np.float32) for letter in "RGB"})
+        for half in halves
+    ]
+    out, few = tmp_path / "out.exr", [flag for flag in FEW if flag not in ("--denoiser", "box")]
+    given = ("--denoised-a", denoised[0], "--denoised-b", denoised[1])
+    result = call("frame", *halves, "-o", out, *few, *given, "--aovs", "auto", "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["denoiser"] == "given"
+    assert f"AOVs: denoised by {denoisers.default()}: --denoised-a and --denoised-b are of the" in result.stderr
+    for names in (ARNOLD, GROUPS):
+        total, picture = sums(out, names)
+        assert np.all(abs(total - picture) <= 1e-5 * picture + 1e-7)
 
 
 def test_a_shot_takes_aovs(halves: list[Path], tmp_path: Path) -> None:

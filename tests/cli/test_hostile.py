@@ -34,7 +34,7 @@ LONG = "x" * 300
         ["--threads", 200_000],
         ["--device", "meta"],
         ["--filters", 10**20],
-        ["--layers", 10**6],
+        ["--network-layers", 10**6],
         ["--batch", 10**9],
         ["--patch", 10**20],
         ["--steps", 10**20],

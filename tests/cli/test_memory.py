@@ -28,7 +28,7 @@ QUICK = [
     "16",
     "--window",
     "3",
-    "--layers",
+    "--network-layers",
     "2",
     "--filters",
     "2",

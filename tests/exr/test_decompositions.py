@@ -108,6 +108,19 @@ def test_two_sets_in_one_file_are_both_found(tmp_path):
     assert [group.name for group in found.groups] == ["Blender's light passes", "light groups Combined_…"]
 
 
+def test_a_transparent_film_leaves_the_world_out(tmp_path):
+    """Blender writes the world into its pass also where the picture is transparent."""
+    world = {f"ViewLayer.Environment.{letter}": light(8, np.float32) for letter in "RGB"}
+    a, b, names = both(tmp_path, "ViewLayer.Combined", BLENDER_5[:-1], **world)
+    found = plan(a, b, names, "auto")
+    assert [group.name for group in found.groups] == ["Blender's light passes before a transparent film"]
+    assert "Environment" not in found.groups[0].wanted
+    assert "do not sum to the picture" in found.lines[0]
+    dark = {name: np.zeros(SIZE, np.float32) for name in world}
+    a, b, names = both(tmp_path, "ViewLayer.Combined", BLENDER_5[:-1], **dark)
+    assert [group.name for group in plan(a, b, names, "auto").groups] == ["Blender's light passes"]
+
+
 def test_a_set_that_does_not_sum_is_said(tmp_path):
     a, b, names = both(tmp_path, "", ["emission", "background", "diffuse"])
     assert plan(a, b, names, "auto").groups

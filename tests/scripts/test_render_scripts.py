@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import json
 import re
 import subprocess
 from pathlib import Path
@@ -11,11 +12,13 @@ import halves
 import numpy as np
 import pytest
 import torch
+from helpers.commands import BALANCED, call
 from helpers.exr_files import assert_passed_through, rewrite, three
 from helpers.render_scripts import BLENDER, BLENDER_TAKEN, CHECKOUT, done, refused
 
 from selfcorrect import exr, files
 from selfcorrect.errors import SettingsError
+from selfcorrect.exr.aovs import plan
 from selfcorrect.history.motion import warped
 from selfcorrect.independence import doubts
 from selfcorrect.shot import framerange
@@ -196,6 +199,16 @@ for layer in scene.view_layers:
     layer.use_pass_cryptomatte_object = layer.use_pass_z = layer.use_pass_normal = layer.use_pass_vector = True
 scene.render.film_transparent = scene.render.use_multiview = True
 """
+LIT = """
+scene.view_layers[0].name = 'Front'
+scene.view_layers.new('Back').samples = 1
+for layer in scene.view_layers:
+    for kind in ('diffuse', 'glossy', 'transmission'):
+        for part in ('direct', 'indirect', 'color'):
+            setattr(layer, f'use_pass_{kind}_{part}', True)
+    layer.use_pass_emit = layer.use_pass_environment = True
+    layer.cycles.use_pass_volume_direct = layer.cycles.use_pass_volume_indirect = True
+"""
 DRIVEN = "scene.driver_add('cycles.seed').driver.expression = '7'"
 KEYED = "scene.keyframe_insert('cycles.seed', frame=1)"
 
@@ -246,6 +259,26 @@ def test_view_layers_and_eyes(blend: Path, tmp_path: Path) -> None:
     rewrite(path, tmp_path / "out.exr", names)
     assert_passed_through(path, tmp_path / "out.exr", but=names)
     assert "cryptomatte" in " ".join(exr.read(tmp_path / "out.exr").parts[0].header)
+
+
+@pytest.mark.blender
+def test_view_layers_are_corrected_together(blend: Path, tmp_path: Path) -> None:
+    """Each with its own light passes, which sum to it."""
+    layered = changed(blend, LIT)
+    done("render/render_blender", layered, "-o", tmp_path, "--spp", 4, "--name", "lit", "--size", "48x32")
+    a, b, out = (tmp_path / f"{name}.exr" for name in ("lit_a", "lit_b", "out"))
+    result = call("frame", a, b, "-o", out, *BALANCED, "--candidates", "none", "--aovs", "auto", "--json")
+    assert result.returncode == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert (told["layer"], list(told["layers"])) == ("Front", ["Back"])
+    file = exr.read(out)
+    for layer in ("Front", "Back"):
+        picture = three(f"{layer}.Combined")
+        assert f"view layer {layer}" in result.stderr
+        (group,) = plan(file, file, picture, "auto").groups
+        assert max(group.closing) < 1e-5
+        noisy = (exr.read(a).pixels(picture[1]) + exr.read(b).pixels(picture[1])) / 2
+        assert not np.allclose(file.pixels(picture[1]), noisy)
 
 
 @pytest.mark.blender

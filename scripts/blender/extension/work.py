@@ -48,7 +48,7 @@ def plan(scene: bpy.types.Scene, command: str | None, frames: range, scratch: Pa
     Another Blender renders a copy of the file, so this one stays usable and none of its settings change.
 
     Args:
-        scene: the scene; its first view layer is corrected.
+        scene: the scene; all its view layers are corrected.
         command: the `selfcorrect` command, None where there is none.
         frames: one frame, or those of a shot.
         scratch: folder for the copy, to be removed afterwards.
