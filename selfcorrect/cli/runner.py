@@ -101,30 +101,33 @@ class Runner:
         _use_machine(options)
         self._options = options
         self._told: dict[str, dict[str, list[str]]] = {}
-        self._denoise = None
-        self._aovs_denoise: Callable[..., Any] | None = None
-        if options.denoiser is not None or not given:
-            self._denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
-            if options.denoiser is None and denoisers.fallback():
-                log(denoisers.fallback())
-        if (getattr(options, "aovs", None) or "none") != "none":
-            self._aovs_denoise = self._denoise
-            if self._aovs_denoise is None:
-                self._aovs_denoise = denoisers.create(self._spec, threads=options.threads, scratch=scratch)
-                log(f"AOVs: denoised by {self._spec}: --denoised-a and --denoised-b are of the picture alone")
+        self._denoise = self._opened(self._spec, scratch) if options.denoiser is not None or not given else None
+        self._aovs_denoise = self._of_aovs(scratch) if (getattr(options, "aovs", None) or "none") != "none" else None
         self._further = {}
         if self._denoise is not None and self.settings.guard and self.settings.candidates != "none":
-            self._further = {
-                spec: denoisers.create(spec, threads=options.threads, scratch=scratch)
-                for spec in denoisers.variants(self._spec)
-            }
+            self._further = {spec: self._opened(spec, scratch) for spec in denoisers.variants(self._spec)}
+        self._tell_what_is_slow()
+
+    def _opened(self, spec: str, scratch: int | None) -> Callable[..., Any]:
+        return denoisers.create(spec, threads=self._options.threads, scratch=scratch)
+
+    def _of_aovs(self, scratch: int | None) -> Callable[..., Any]:
+        """The picture's denoiser, or the default one where the picture's denoised halves are given."""
+        if self._denoise is not None:
+            return self._denoise
+        log(f"AOVs: denoised by {self._spec}: --denoised-a and --denoised-b are of the picture alone")
+        return self._opened(self._spec, scratch)
+
+    def _tell_what_is_slow(self) -> None:
+        if self._denoise is not None and self._options.denoiser is None and denoisers.fallback():
+            log(denoisers.fallback())
         if not installed():
             log(f"warning: {missing()}")
-        if torch.device(options.device).type != "cpu":
+        if torch.device(self._options.device).type != "cpu":
             bound = [stage.name for stage in self._stages if stage.on_cpu]
             bound += [] if self._denoise is None else [f"the denoiser {self.denoiser}"]
             if bound:
-                log(f"{' and '.join(bound)}: on the CPU; all else on {options.device}")
+                log(f"{' and '.join(bound)}: on the CPU; all else on {self._options.device}")
 
     @property
     def denoiser(self) -> str:
