@@ -1,16 +1,19 @@
 """Does the witness tell the truth: what the core changed in the halves, by the other half and by references.
 
-    .venv/bin/python scripts/bench/witness.py ../shared/frames [--frames NAME ...] [--spp 64] [--features own mean]
+    .venv/bin/python scripts/bench/witness.py ../shared/frames [--spp 64] [--features own mean] [--limits 0 8]
 
 Half b judges what was made of half a, so its noise must not be in there. The script trains on a frame whose halves keep
 their own G-buffers (``own``, what the tool does), or both get the mean of the two (``mean``, which is less noisy but
-brings half b's noise into half a's correction), or have albedo and normal denoised by OIDN (``prefiltered``). It prints
-the change of the halves' relative squared error, as a share of the denoised halves' error, by the references and by the
-witness, their difference with its standard error over tiles of 16 pixels (negative: the witness promises what is not
-there), and the relMSE of the core's full image, before the guard, over that of the denoised one.
+brings half b's noise into half a's correction), or have albedo and normal denoised by OIDN (``prefiltered``), and with
+several bounds of the witness (the setting ``witness_limit``). It prints the change of the halves' relative squared
+error, as a share of the denoised halves' error, by the references and by the witness, their difference with its
+standard error over tiles of 16 pixels (negative: the witness promises what is not there), and the output's relMSE over
+that of the denoised image, with what the guard believes of it.
 """
 
 import argparse
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +23,11 @@ from torch import Tensor
 
 import denoisers
 from denoisers.oidn import PrefilteringOidn
-from selfcorrect import Frame, Settings, metrics, stages
+from selfcorrect import Frame, Settings, correct, metrics
 from selfcorrect.image.bands import tile_means
-from selfcorrect.image.exposure import scale_to_one
+from selfcorrect.stages.core.stage import Core
 from selfcorrect.stages.images import StageImages
-from selfcorrect.stages.stage import Work
+from selfcorrect.stages.stage import Outcome, Work
 
 _DARKEST = 0.01  # squared radiance, as in the metric
 
@@ -35,32 +38,69 @@ def main() -> None:
     parser.add_argument("--frames", nargs="*", help="names; by default all in the folder")
     parser.add_argument("--spp", type=int, nargs="*", default=[64])
     parser.add_argument("--features", nargs="*", choices=FEATURES, default=list(FEATURES))
+    parser.add_argument("--limits", type=float, nargs="*", default=[Settings.preset("balanced").witness_limit])
     parser.add_argument("--denoiser", default="oidn")
     parser.add_argument("--preset", default="balanced")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    print("| frame | spp | G-buffers | change by references | by the witness | difference ± s.e. | full image |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "| frame | spp | G-buffers | limit | change by references | by the witness | difference | output (believed) |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
     for name in options.frames or sorted({path.name.split("_")[0] for path in options.folder.glob("*_ref_A.exr")}):
         for spp in options.spp:
             frame, references = load(options.folder, name, spp)
             frame = frame.denoise(denoisers.create(options.denoiser, threads=options.threads))
-            for features in options.features:
-                cells = row(options.preset, frame, references, features)
-                print(f"| {name} | {spp} | {features} | {cells} |", flush=True)
+            for features, limit in product(options.features, options.limits):
+                settings = Settings.preset(options.preset, candidates="none", fireflies="keep", witness_limit=limit)
+                cells = row(settings, with_features(frame, features), references)
+                print(f"| {name} | {spp} | {features} | {limit:g} | {cells} |", flush=True)
 
 
-def row(preset: str, frame: Frame, references: list[np.ndarray], features: str) -> str:
+def row(settings: Settings, frame: Frame, references: list[np.ndarray]) -> str:
     """The cells of one training."""
-    pairs = FEATURES[features](frame)
-    frame = Frame(color=frame.color, **pairs, denoised=frame.denoised, denoised_full=frame.denoised_full)
-    state = core(frame, Settings.preset(preset))
+    core = Recorded(settings)
+    result = correct(frame, settings, opened=[core])
     reference_a, reference_b, smooth = (torch.as_tensor(image) for image in references)
-    true, told = changes(frame, state.images, (reference_a + reference_b) / 2, smooth)
+    true, told = changes(frame, core.corrected, (reference_a + reference_b) / 2, smooth)
     error = (told - true).std() / len(true) ** 0.5
-    ratio = metrics.relmse(state.full, *references) / metrics.relmse(frame.denoised_full, *references)
-    return f"{true.mean():+.3f} | {told.mean():+.3f} | {(told - true).mean():+.3f} ± {error:.3f} | {ratio:.3f}"
+    ratio = metrics.relmse(result.image, *references) / metrics.relmse(frame.denoised_full, *references)
+    assert result.estimate is not None  # the preset has the guard
+    return (
+        f"{true.mean():+.3f} | {told.mean():+.3f} | {(told - true).mean():+.3f} ± {error:.3f} "
+        f"| {ratio:.3f} ({1 + result.estimate.change:.3f})"
+    )
+
+
+class Recorded(Core):
+    """The core, and the halves that it made."""
+
+    def __init__(self, settings: Settings):
+        super().__init__(settings)
+        self._strips: list[tuple[Tensor, Tensor]] = []
+
+    @property
+    def corrected(self) -> tuple[Tensor, Tensor]:
+        """Of linear radiance."""
+        a, b = (torch.cat(strips) for strips in zip(*self._strips, strict=True))
+        return a, b
+
+    def run(self, state: StageImages, work: Work) -> Outcome:
+        """Strips come from top to bottom."""
+
+        def keep(rows: slice, halves: tuple[Tensor, Tensor]) -> None:
+            self._strips.append((halves[0] / state.scale, halves[1] / state.scale))
+            if work.keep is not None:
+                work.keep(rows, halves)
+
+        return super().run(state, replace(work, keep=keep))
+
+
+def with_features(frame: Frame, features: str) -> Frame:
+    """The frame with its denoised images, and with other G-buffers."""
+    pairs = FEATURES[features](frame)
+    return Frame(color=frame.color, **pairs, denoised=frame.denoised, denoised_full=frame.denoised_full)
 
 
 def features_of(frame: Frame) -> dict[str, tuple[Tensor, Tensor]]:
@@ -82,15 +122,6 @@ def prefiltered(frame: Frame) -> dict[str, tuple[Tensor, Tensor]]:
 
 
 FEATURES = {"own": features_of, "mean": mean, "prefiltered": prefiltered}
-
-
-def core(frame: Frame, settings: Settings) -> StageImages:
-    """What the settings' stages make of a frame, without the guard."""
-    given = frame.candidates[0]
-    state = StageImages.of(frame.halves, given, scale_to_one(given.halves))
-    for stage in stages.opened(settings):
-        state = stage.run(state, Work()).state
-    return state
 
 
 def changes(frame: Frame, corrected: tuple[Tensor, Tensor], reference: Tensor, smooth: Tensor) -> tuple[Tensor, Tensor]:
