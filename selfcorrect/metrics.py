@@ -1,8 +1,8 @@
 r"""How far an image is from its reference: relMSE with a standard error, PSNR, SSIM, ꟻLIP, mean radiance.
 
-Every image is an array or tensor (H, W, 3) of linear radiance, of any float type, on any device; every
-result is computed on the CPU and a Python float. Input that is not finite, or whose size differs, raises
-`FrameError`.
+Every image is an array or tensor (H, W, 3) of linear radiance, of any float type, on any device; every result is a
+Python float, computed on the first image's device (SSIM, ꟻLIP and resampling on the CPU). Input that is not finite, or whose
+size differs, raises `FrameError`.
 """
 
 import math
@@ -272,7 +272,7 @@ def ssim(image: Image, reference: Image) -> float:
             f"expected an image of at least {SSIM_WINDOW}×{SSIM_WINDOW} pixels for SSIM, but got {_size(x)}"
         )
     # Single precision is several times faster here and moves the mean by less than 1e-5.
-    x_planes, r_planes = (tone_map(each).movedim(-1, 0)[None].float().contiguous() for each in (x, r))
+    x_planes, r_planes = (tone_map(each).cpu().movedim(-1, 0)[None].float().contiguous() for each in (x, r))
     similarity = kornia.metrics.ssim(x_planes, r_planes, SSIM_WINDOW, eps=0.0, padding="valid")
     return float(similarity.double().mean())
 
@@ -300,7 +300,7 @@ def flip(image: Image, reference: Image) -> float:
         raise FrameError(f"expected a reference brighter than 1e-6 for FLIP, but got at most {luminance:.3g}")
     # ꟻLIP computes in single precision: a larger value in the reference would be infinite, and the error 0.
     x, r = (each.clamp(0, 1e38).float() for each in (x, r))
-    _, mean, _ = flip_evaluator.evaluate(r.numpy(), x.numpy(), "HDR", applyMagma=False)
+    _, mean, _ = flip_evaluator.evaluate(r.cpu().numpy(), x.cpu().numpy(), "HDR", applyMagma=False)
     return float(mean)
 
 
@@ -328,7 +328,7 @@ def tone_map(image: Image) -> Tensor:
         image: (H, W, 3) linear radiance.
 
     Returns:
-        (H, W, 3) float64 on the CPU, in [0, 1].
+        (H, W, 3) float64, in [0, 1].
 
     Source:
         IEC 61966-2-1.
@@ -354,7 +354,7 @@ def _resampled_means(errors: Tensor, seed: int | torch.Generator) -> Tensor:
     planes = torch.cat([errors, torch.ones_like(errors[:1])])
     pooled = functional.avg_pool2d(planes, TILE, ceil_mode=True, divisor_override=1)
     # NumPy starts no threads here: a thousand small barriers would stall where other programs hold the cores.
-    tiles = pooled.flatten(1).numpy()  # (K + 1, T): the sums over each tile, the last its pixels
+    tiles = pooled.flatten(1).cpu().numpy()  # (K + 1, T): the sums over each tile, the last its pixels
     count = tiles.shape[1]
     if count == 1:
         return torch.full((RESAMPLES, len(errors)), math.nan)
@@ -377,11 +377,14 @@ def _pair(image: Image, reference: Image) -> tuple[Tensor, Tensor]:
 
 
 def _radiance(name: str, values: Image, like: Tensor | None = None) -> Tensor:
-    """Copy to (H, W, 3) float64 on the CPU, checked."""
+    """Copy to (H, W, 3) float64, checked; on the device of ``like`` or its own, if that one has float64."""
     if isinstance(values, Tensor):
-        radiance = values.detach().to("cpu", torch.float64)
+        own = "cpu" if values.device.type == "mps" else values.device
+        radiance = values.detach().to(own, torch.float64)
     else:
         radiance = torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
+    if like is not None:
+        radiance = radiance.to(like.device)
     if radiance.ndim != 3 or radiance.shape[2] != 3 or radiance.numel() == 0:
         raise FrameError(f"expected {name} of shape (H, W, 3), but got {tuple(radiance.shape)}")
     if like is not None and radiance.shape != like.shape:

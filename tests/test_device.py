@@ -12,6 +12,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from helpers.elsewhere import ELSEWHERE, Elsewhere, elsewhere
 from helpers.tolerances import INTERPRETED_LOSS, near
 from torch import Tensor
 
-from selfcorrect import Frame, Settings, cli, correct
+from selfcorrect import Frame, Settings, cli, correct, metrics
 from selfcorrect.cli import runner
 from selfcorrect.cli.flags import add_run_flags
 from selfcorrect.errors import DeviceError, MissingPackageError
@@ -131,6 +132,15 @@ def test_a_whole_frame_elsewhere(stages: str) -> None:
         blend = result.maps["blend"].cpu()
     torch.testing.assert_close(result.image, here.image, **near("whole frame elsewhere"))
     torch.testing.assert_close(blend, here.maps["blend"], **near("whole frame elsewhere"))
+
+
+def test_metrics_elsewhere() -> None:
+    generator = torch.Generator().manual_seed(0)
+    images = [torch.rand(16, 20, 3, generator=generator) + 0.1 for _ in range(4)]
+    here = metrics.compare(*images)
+    with elsewhere():
+        there = metrics.compare(*(image.to(ELSEWHERE) for image in images))
+    assert astuple(there) == pytest.approx(astuple(here), rel=1e-12)  # 0 here
 
 
 def test_the_disguise_refuses_what_a_device_would() -> None:
