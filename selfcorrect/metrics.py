@@ -1,8 +1,8 @@
 r"""How far an image is from its reference: relMSE with a standard error, PSNR, SSIM, ꟻLIP, mean radiance.
 
 Every image is an array or tensor (H, W, 3) of linear radiance, of any float type, on any device; every result is a
-Python float, computed on the first image's device (SSIM, ꟻLIP and resampling on the CPU). Input that is not finite, or whose
-size differs, raises `FrameError`.
+Python float, computed on the first image's device (SSIM, ꟻLIP and resampling on the CPU). Input that is not finite, or
+whose size differs, raises `FrameError`.
 """
 
 import math
@@ -293,14 +293,14 @@ def flip(image: Image, reference: Image) -> float:
     Source:
         Andersson et al., Visualizing errors in rendered high dynamic range images, 2021, by `flip-evaluator`.
     """
-    x, r = _pair(image, reference)
+    x, r = (each.cpu() for each in _pair(image, reference))
     luminance = float((r @ r.new_tensor([0.2126, 0.7152, 0.0722])).max())
     # Below about 1.2e-7 ꟻLIP finds no range of exposures and ends the whole process.
     if luminance < 1e-6:
         raise FrameError(f"expected a reference brighter than 1e-6 for FLIP, but got at most {luminance:.3g}")
     # ꟻLIP computes in single precision: a larger value in the reference would be infinite, and the error 0.
     x, r = (each.clamp(0, 1e38).float() for each in (x, r))
-    _, mean, _ = flip_evaluator.evaluate(r.cpu().numpy(), x.cpu().numpy(), "HDR", applyMagma=False)
+    _, mean, _ = flip_evaluator.evaluate(r.numpy(), x.numpy(), "HDR", applyMagma=False)
     return float(mean)
 
 
