@@ -54,17 +54,19 @@ def correct_channels(
     """
     found, done = Channels({}, [], {}), dict[str, Tensor]()
     target = torch.as_tensor(image).float().cpu()
-    for group in plan.groups:
+    for i, group in enumerate(plan.groups):
+        later = {aov.name for other in plan.groups[i + 1 :] for aov in other.aovs}
         if group.sums:
             images = _sum(halves, group, target, done, frame, denoise, found, pass_through=pass_through)
         else:
             pairs = Halves(*halves, group.aovs)
             images = {name: correct_alone(frame, name, pairs[name], denoise) for name in pairs}
-        done |= images
+        done |= {name: image for name, image in images.items() if name in later}
         for aov in group.aovs:
-            if aov.name in group.wanted and aov.name in images:
-                own = planes_of(*halves, aov, images[aov.name].numpy(), pass_through=pass_through)
-                found.planes.update(own)
+            image = images.pop(aov.name, None)  # what is written takes its place in memory
+            if aov.name in group.wanted and image is not None:
+                found.planes.update(planes_of(*halves, aov, image.numpy(), pass_through=pass_through))
+                del image
     if plan.alpha:
         found.planes[plan.alpha] = _alpha(halves, plan.alpha, frame, denoise)
     return found
