@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from selfcorrect.aovs import AovSum, Denoise, correct_alone, correct_aovs
@@ -53,17 +54,19 @@ def correct_channels(
     """
     found, done = Channels({}, [], {}), dict[str, Tensor]()
     target = torch.as_tensor(image).float().cpu()
-    for group in plan.groups:
+    for i, group in enumerate(plan.groups):
+        later = {aov.name for other in plan.groups[i + 1 :] for aov in other.aovs}
         if group.sums:
             images = _sum(halves, group, target, done, frame, denoise, found, pass_through=pass_through)
         else:
             pairs = Halves(*halves, group.aovs)
             images = {name: correct_alone(frame, name, pairs[name], denoise) for name in pairs}
-        done |= images
+        done |= {name: image for name, image in images.items() if name in later}
         for aov in group.aovs:
-            if aov.name in group.wanted and aov.name in images:
-                own = planes_of(*halves, aov, images[aov.name].numpy(), pass_through=pass_through)
-                found.planes.update(own)
+            image = images.pop(aov.name, None)  # what is written takes its place in memory
+            if aov.name in group.wanted and image is not None:
+                found.planes.update(planes_of(*halves, aov, image.numpy(), pass_through=pass_through))
+                del image
     if plan.alpha:
         found.planes[plan.alpha] = _alpha(halves, plan.alpha, frame, denoise)
     return found
@@ -106,8 +109,13 @@ def _sum(
 
 
 def _alpha(halves: tuple[ExrFile, ExrFile], name: str, frame: Frame, denoise: Denoise) -> Pixels:
-    """Alpha, denoised like a grey AOV, in [0, 1]."""
-    first, second = (np.repeat(file.pixels(name).astype(np.float32)[:, :, None], 3, -1) for file in halves)
-    image = correct_alone(frame, "alpha", (first, second), denoise)
-    alpha: Pixels = image.mean(-1).clamp(0, 1).numpy().astype(halves[0].pixels(name).dtype)
+    """Alpha, denoised like a grey AOV, in [0, 1]; where both halves are 1 for a pixel and its neighbours it stays 1,
+    as it stays 0 where they are 0.
+    """
+    planes = [file.pixels(name).astype(np.float32) for file in halves]
+    first, second = (np.repeat(plane[:, :, None], 3, -1) for plane in planes)
+    image = correct_alone(frame, "alpha", (first, second), denoise).mean(-1).clamp(0, 1)
+    open_ = torch.from_numpy(np.minimum(*planes) < 1).float()
+    solid = F.max_pool2d(open_[None], 3, 1, 1)[0] == 0
+    alpha: Pixels = torch.where(solid, 1.0, image).numpy().astype(halves[0].pixels(name).dtype)
     return alpha

@@ -213,9 +213,9 @@ def _corrects(sources: Sources) -> bool:
 
 
 def _of_aovs(pixels: int, count: int, half: float, held: float) -> float:
-    """At most every channel is of an AOV, each of which is kept in float32, with where it has light, and as written."""
+    """At most every channel is of an AOV, each of which is kept in float32, with where it has light, or as written."""
     image = pixels * _RGB
-    kept = 1.25 * image * (count / 3) + held
+    kept = 1.25 * image * (count / 3)
     working = 12 * image  # denoised halves and their mean, the guides of each, one AOV's evidence
     return BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
 

@@ -134,6 +134,23 @@ def test_named_aovs_alone_are_written(halves: list[Path], tmp_path: Path) -> Non
     assert not np.array_equal(alpha, noisy)
 
 
+def test_alpha_stays_whole_where_it_is(tmp_path: Path) -> None:
+    """Denoised at the noisy edge between what is solid and what is empty, exact on both sides of it."""
+    halves = []
+    for half, seed in (("a", 1), ("b", 2)):
+        alpha = np.random.default_rng(seed).random(SIZE, dtype=np.float32)
+        alpha[:, :10], alpha[:, 20:] = 1, 0
+        halves.append(arnold(tmp_path / f"{half}.exr", seed, A=alpha))
+    out = tmp_path / "out.exr"
+    generated = [exr.read(path).pixels("A") for path in halves]
+    assert call("frame", *halves, "-o", out, *FEW, "--aovs", "alpha").returncode == 0
+    alpha = exr.read(out).pixels("A")
+    assert (alpha[:, :9] == 1).all()
+    assert (alpha[:, 21:] == 0).all()
+    assert ((alpha >= 0) & (alpha <= 1)).all()
+    assert alpha[:, 11:19].var() < ((generated[0] + generated[1]) / 2)[:, 11:19].var()
+
+
 def test_a_set_that_does_not_sum_is_said_and_left(tmp_path: Path) -> None:
     halves = []
     for half, seed in (("a", 1), ("b", 2)):
