@@ -23,7 +23,7 @@ from selfcorrect.stages.core.infer import SIDE
 from selfcorrect.stages.core.network import Network
 from selfcorrect.stages.core.train import Progress
 from selfcorrect.stages.images import StageImages
-from selfcorrect.stages.stage import Images, Stage, Start, Work
+from selfcorrect.stages.stage import Images, Learned, Stage, Start, Work
 
 __all__ = ["COLOR_OUTPUT", "Result", "Start", "correct"]
 
@@ -148,20 +148,8 @@ def correct(
     lone = lone_pixels(frame.halves, first.scale) if settings.guard else torch.empty(0, 2)
     first = first._replace(halves=set_aside(first.halves, lone))
     judge = _Judge(first, more) if settings.guard else None
-    state, learned, seconds = first, None, dict[str, float]()
-    for stage in opened:
-        begun = time.perf_counter()
-        beyond = (extra or {}).get(stage.name)
-        work = Work(
-            warm_start=warm_start if stage.learns else None,
-            progress=progress,
-            stop=stop,
-            extra=None if beyond is None else beyond.to(first.full.device),
-            keep=judge.keep if judge is not None and stage is opened[-1] else None,
-        )
-        state, just_learned, parts = stage.run(state, work)
-        learned = just_learned or learned
-        seconds |= parts or {stage.name: time.perf_counter() - begun}
+    work = Work(warm_start=warm_start, progress=progress, stop=stop)
+    state, learned, seconds = _through(opened, first, work, extra or {}, judge)
     image, guarded = state.full.clamp(min=0), None
     if judge is not None:
         begun = time.perf_counter()
@@ -187,6 +175,26 @@ def correct(
         start=learned.start if learned else Start(warm=False),
         lone=len(lone),
     )
+
+
+def _through(
+    opened: Sequence[Stage], state: StageImages, work: Work, extra: Mapping[str, Images], judge: "_Judge | None"
+) -> tuple[StageImages, Learned | None, dict[str, float]]:
+    """The state after all stages, what was learned last, and the seconds of each."""
+    learned, seconds = None, dict[str, float]()
+    for stage in opened:
+        begun = time.perf_counter()
+        beyond = extra.get(stage.name)
+        own = replace(
+            work,
+            warm_start=work.warm_start if stage.learns else None,
+            extra=None if beyond is None else beyond.to(state.full.device),
+            keep=judge.keep if judge is not None and stage is opened[-1] else None,
+        )
+        state, just_learned, parts = stage.run(state, own)
+        learned = just_learned or learned
+        seconds |= parts or {stage.name: time.perf_counter() - begun}
+    return state, learned, seconds
 
 
 def _kept(frame: Frame, first: StageImages) -> Result:
