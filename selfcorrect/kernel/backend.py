@@ -50,7 +50,7 @@ def choose(
     if backend not in offered:
         raise SettingsError(f"expected a backend out of {', '.join(offered)}, but got {backend!r}")
     if backend == "cpu" and not installed():
-        raise SettingsError(f"expected another backend than cpu: {missing()}")
+        raise SettingsError(f"expected the compiled kernels for the backend cpu, but got none: {missing()}")
     if backend == "cpu" and not compiled:
         taken = " or ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
         wanted = f"{taken} on cpu" + (f" and {limit}" if limit else "")

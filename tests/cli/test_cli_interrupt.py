@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,15 @@ LOADED = ["libc10", "libtorch_cpu", "libtorch_python", "_multiarray_umath", "_sa
 """Libraries that the imports load one after the other: each is a moment of the start."""
 
 
+@pytest.fixture
+def heeded() -> Iterator[None]:
+    """Interrupts that processes started here heed, also where the tests run in a shell's background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heeded")
 @pytest.mark.parametrize("library", LOADED)
 @pytest.mark.parametrize("how", ["module", "script"])
 def test_an_interrupt_during_the_imports_ends_quietly(library: str, how: str, halves: tuple[Path, Path]) -> None:

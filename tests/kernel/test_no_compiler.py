@@ -87,4 +87,4 @@ def test_asked_for_by_name(tmp_path: Path) -> None:
         "try: choose('cpu', [torch.zeros(1)])\nexcept SettingsError as error: print(error)"
     )
     told = run(HIDDEN + source, folder=tmp_path).stdout
-    assert told.startswith("expected another backend than cpu: the compiled kernels are not installed")
+    assert told.startswith("expected the compiled kernels for the backend cpu, but got none: the compiled kernels")
