@@ -1,7 +1,7 @@
 """Fireflies that the denoiser has left: two independent halves show them, where no single image can.
 
 A path of great energy that one half has met and the other has not stays in that half's denoised image as a bright spot,
-and in that of both. Where one denoised half is far brighter than the other, the darker one is taken, if five things say
+and in that of both. Where one denoised half is far brighter than the other, the darker one is taken, if six things say
 that chance has met a firefly and not the other half missed a light. With m the mean of a half's channels, of a frame
 whose mean is near 1, and ε = 0.1:
 
@@ -17,6 +17,9 @@ whose mean is near 1, and ε = 0.1:
 5. Nowhere within four pixels is there a pixel of the spot around which the other half's noisy pixels, again within
    four, reach half of the brightest of the spot's own half. In a caustic both meet paths of the same great energy, one
    here and one beside: however few, they are light.
+6. Nor is there a pixel of the spot around which, again within four, its own half has more than two peaks (as bright as
+   any of the eight around) that reach half of the brightest. What three pixels have met alike is light, of which one
+   half has met more than its share, but the other is further from the truth.
 
 What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
 given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
@@ -40,7 +43,7 @@ _AROUND = 2  # tiles on each side, of which the median is taken
 _GROWN = 2  # pixels
 _WITNESS = 5  # side of the window of noisy pixels
 _SPOT = 4  # pixels from a spot's brightest part
-_REACH = 2 * _GROWN + 3 * _SPOT
+_REACH = 2 * _GROWN + 3 * _SPOT + 1
 _MOST_PIXELS = 2**20  # that tell what is bright, in rows spread evenly over the frame
 _STRICTER = 2.0  # each time too much would go, the threshold is multiplied by this
 _TRIES = 5
@@ -58,7 +61,9 @@ class Rule(NamedTuple):
         quantile: of δ in a tile, that is its spread.
         darkest: ε.
         doubts: standard errors of the other half's noisy pixels.
-        alike: share of a firefly's noisy radiance that the other half's pixels nearby must not reach.
+        alike: share of a firefly's noisy radiance that the other half's pixels nearby must not reach, and of its own
+            half's no more peaks than ``peaks``.
+        peaks: the most pixels that one firefly, or two, may show in.
         usual: share of the pixels, 0 … 1, that are darker than what may be a light.
         most: share of the image's light, 0 … 1, that may go.
     """
@@ -69,6 +74,7 @@ class Rule(NamedTuple):
     darkest: float = 0.1
     doubts: float = 2.0
     alike: float = 0.5
+    peaks: int = 2
     usual: float = 0.99
     most: float = 0.01
 
@@ -174,7 +180,8 @@ class _Search:
         threshold = self.stricter * (self._rule.spreads * spread).clamp(min=math.log(self._rule.least))
         found = (self._disagreement(wide) > threshold) & (torch.minimum(a, b) <= self._usual)
         found &= self._contradicted(a, b, wide)
-        found &= _largest_around(found & self._met_by_both(a, b, wide), _SPOT) == 0
+        light = self._met_by_both(a, b, wide) & found | self._met_by_many(found, a, b, wide)
+        found &= _largest_around(light, _SPOT) == 0
         spot = found & (torch.maximum(a, b) > self._usual)
         found &= _largest_around(spot, _SPOT) > 0
         return _mean_around(_largest_around(found, _GROWN), _GROWN)[inner]
@@ -193,6 +200,18 @@ class _Search:
         """Whether the darker half's noisy pixels nearby are about as bright as the brighter one's, (rows, W)."""
         in_a, in_b = (_largest_around(noisy, _SPOT) for noisy in self._means(self._color, rows))
         return torch.where(a > b, in_b > self._rule.alike * in_a, in_a > self._rule.alike * in_b)
+
+    def _met_by_many(self, found: Tensor, a: Tensor, b: Tensor, rows: slice) -> Tensor:
+        """Where found, whether more peaks of the brighter half's noisy pixels nearby are alike than a firefly has."""
+        side = 2 * _SPOT + 1
+        met = []
+        for noisy in self._means(self._color, rows):
+            peaks = F.pad(noisy.where(noisy == _largest_around(noisy, 1), 0.0), (_SPOT,) * 4)
+            met.append(peaks.unfold(0, side, 1).unfold(1, side, 1)[found].flatten(1))
+        highest = torch.where((a > b)[found][:, None], *met).topk(self._rule.peaks + 1).values
+        many = torch.zeros_like(found)
+        many[found] = highest[:, -1] > self._rule.alike * highest[:, 0]
+        return many
 
     def excess(self, image: Radiance, rows: slice) -> Tensor:
         """What to take off rows of an image, (rows, W, 3) ≥ 0."""

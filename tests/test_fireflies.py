@@ -110,6 +110,22 @@ def test_light_that_the_other_half_has_met_beside_it_stays(energy: float, goes: 
     assert not goes or error(image, clean) < 0.1 * error(before, clean)
 
 
+@pytest.mark.parametrize(("pixels", "goes"), [(1, True), (2, True), (3, False)])
+def test_light_that_many_pixels_of_its_own_half_have_met_stays(pixels: int, goes: bool) -> None:
+    """Of the same energy, a few pixels apart; the other half has met none."""
+    clean, pair = truth(), halves(truth())
+    noise = error((pair[0] + pair[1]) / 2, clean)
+    noisy = [half.clone() for half in pair]
+    for x in range(pixels):
+        pair[0] = pair[0] + spot(SIZE, 40, 50 + 3 * x, 30.0)
+        noisy[0][40, 50 + 3 * x] += 30.0
+    before = (pair[0] + pair[1]) / 2
+    image, found = removed(pair, noisy)
+    assert (found.pixels > 0) == goes
+    assert goes or torch.equal(image, before)
+    assert not goes or error(image, clean) - noise < 0.1 * error(before, clean)
+
+
 def test_a_caustic_explains_itself() -> None:
     """A region of 60 pixels where the halves disagree, and the noisy ones more, in a frame where they agree."""
     strength = torch.zeros(*SIZE, 1)
@@ -152,6 +168,9 @@ def test_it_is_the_rule_that_the_docstring_describes(size: tuple[int, int]) -> N
         noisy[0] = noisy[0] + spot(size, y, size[1] // 2)
         if y % 2:  # every other one is light that half b has met beside it
             noisy[1][y + 3, size[1] // 2 - 3] += 20
+        elif y % 4:  # of the others, every other one half a itself has met thrice
+            for shift in (-3, 0, 3):
+                noisy[0][y + 2, size[1] // 2 + shift] += 60
     expected = ((pair[0] + pair[1]) / 2).double().numpy()
     (a, b), (ya, yb) = ([half.double().mean(-1).numpy() for half in two] for two in (pair, noisy))
     delta = np.abs(np.log((a + 0.1) / (b + 0.1)))
@@ -162,7 +181,10 @@ def test_it_is_the_rule_that_the_docstring_describes(size: tuple[int, int]) -> N
     found &= bright - mean > 2 * deviation / 5
     near = [windows(y, 4, np.max) for y in (ya, yb)]
     met = found & np.where(a > b, near[1] > 0.5 * near[0], near[0] > 0.5 * near[1])
-    found &= ~windows(met, 4, np.max)
+    peaks = [np.where(y == windows(y, 1, np.max), y, 0) for y in (ya, yb)]
+    alike = [windows(y, 4, lambda near: (near > 0.5 * near.max()).sum()) for y in peaks]
+    many = found & (np.where(a > b, *alike) > 2)
+    found &= ~windows(met | many, 4, np.max)
     found &= windows(found & (np.maximum(a, b) > usual), 4, np.max)
     weight = windows(windows(found, 2, np.max).astype(float), 2, np.mean)
     darker = np.where((a < b)[..., None], pair[0].double().numpy(), pair[1].double().numpy())
