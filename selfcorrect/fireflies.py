@@ -204,11 +204,13 @@ class _Search:
     def _met_by_many(self, found: Tensor, a: Tensor, b: Tensor, rows: slice) -> Tensor:
         """Where found, whether more peaks of the brighter half's noisy pixels nearby are alike than a firefly has."""
         side = 2 * _SPOT + 1
-        met = []
-        for noisy in self._means(self._color, rows):
+
+        def around(noisy: Tensor) -> Tensor:
             peaks = F.pad(noisy.where(noisy == _largest_around(noisy, 1), 0.0), (_SPOT,) * 4)
-            met.append(peaks.unfold(0, side, 1).unfold(1, side, 1)[found].flatten(1))
-        highest = torch.where((a > b)[found][:, None], *met).topk(self._rule.peaks + 1).values
+            return peaks.unfold(0, side, 1).unfold(1, side, 1)[found].flatten(1)
+
+        in_a, in_b = (around(noisy) for noisy in self._means(self._color, rows))
+        highest = torch.where((a > b)[found][:, None], in_a, in_b).topk(self._rule.peaks + 1).values
         many = torch.zeros_like(found)
         many[found] = highest[:, -1] > self._rule.alike * highest[:, 0]
         return many

@@ -27,14 +27,24 @@ def load(folder: Path, name: str, spp: int) -> tuple[Frame, list[np.ndarray]]:
     """A frame and its references: two independent ones, and the smooth one.
 
     With 0 samples the two references become the halves of the best frame there is, and the halves of 256 samples,
-    which are as independent, its references.
+    which are as independent, its references. Where there is no smooth one, it is OIDN's image of both references.
     """
     a, b = (exr.load_half(folder / f"{name}_{spp or 256:03d}spp_{half}.exr").buffers for half in "AB")
-    references = [exr.load_half(folder / f"{name}_ref_{r}.exr").buffers["color"] for r in ("A", "B", "smooth")]
+    first, second = (exr.load_half(folder / f"{name}_ref_{r}.exr").buffers for r in "AB")
+    smooth = folder / f"{name}_ref_smooth.exr"
+    weight = exr.load_half(smooth).buffers["color"] if smooth.exists() else denoised_mean(first, second)
+    references = [first["color"], second["color"], weight]
     if not spp:
         for half, reference in ((a, 0), (b, 1)):
             half["color"], references[reference] = references[reference], half["color"]
     return Frame(**{role: (a[role], b[role]) for role in ROLES if role in a}), references
+
+
+def denoised_mean(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> np.ndarray:
+    """OIDN's image of two halves together."""
+    aids = {role: (first[role], second[role]) for role in ("albedo", "normal") if role in first}
+    halves = Frame(color=(first["color"], second["color"]), **aids)
+    return halves.denoise(denoisers.create("oidn")).denoised_full.numpy()
 
 
 def main() -> None:
