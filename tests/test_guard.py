@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import torch.nn.functional as F
 from helpers.tolerances import EXACT, LIGHT, near
 from torch import Tensor
 
@@ -90,6 +91,34 @@ def test_only_the_better_part_is_taken(seed: int) -> None:
 def test_fireflies_in_the_witness_do_no_harm(size: float, seed: int) -> None:
     guarded, truth = run(noise(size, 97), seed=seed, fireflies=40)
     assert error(guarded.image, truth) < 1.02 * denoised_error()
+
+
+@pytest.mark.parametrize("filter_width", [0.0, 0.5])
+@pytest.mark.parametrize("reach", [1, 4])
+def test_a_mean_of_its_own_half_s_noise_is_seldom_taken(reach: int, filter_width: float) -> None:
+    """Nothing is to be gained; the noise of both halves is the evidence, with a wide pixel filter also in its tiles.
+
+    A judgement of one direction by the other would see a gain nearly always: both sum the same products of noise.
+    """
+    truth, taken, seeds = scene(), 0, 20
+    for seed in range(seeds):
+        color = [truth + filtered(noise(0.5, 10 * seed + i), filter_width) for i in (1, 2)]
+        a, b = (truth + 0.3 * filtered(half - truth, reach / 2) / (2 * reach) for half in color)
+        guarded = guard((color[0], color[1]), (truth, truth), (a, b), truth, (a + b) / 2)
+        taken += guarded.estimate.improved
+    assert taken <= 5, "one in twenty, were the tiles independent"
+
+
+def filtered(image: Tensor, width: float) -> Tensor:
+    """Filtered by a Gaussian of this deviation in pixels; white noise keeps its variance."""
+    if not width:
+        return image
+    at = torch.arange(-4.0, 5.0)
+    weights = torch.exp(-(at**2) / (2 * width**2))
+    weights /= weights.square().sum().sqrt()
+    planes = F.pad(image.permute(2, 0, 1)[:, None], (4, 4, 4, 4), mode="replicate")
+    rows = F.conv2d(planes, weights.reshape(1, 1, 1, 9))
+    return F.conv2d(rows, weights.reshape(1, 1, 9, 1))[:, 0].permute(1, 2, 0)
 
 
 def test_nothing_to_gain_gives_the_denoised_image() -> None:
