@@ -40,7 +40,7 @@ class Denoised:
         repairs: by buffer, how many pixels were changed on the way in.
         constant: the G-buffers that are the same at every pixel, and not used.
         seconds: of reading and denoising.
-        promises: by name of a further denoiser, the share of the error that its image promised to take off.
+        promises: by name of a further denoiser, the share of the error that its image may take off at most.
         candidates: the further images that the guard may blend in.
         history: what the neighbours of a frame of a shot gave; None where they were not asked.
     """
@@ -96,7 +96,7 @@ class Denoised:
             if any(counts)
         ]
         further = [
-            f"candidate {name}: {'taken' if name in self.candidates else 'left out'}, a few crops promise "
+            f"candidate {name}: {'taken' if name in self.candidates else 'left out'}, a few crops promise up to "
             f"{100 * promise:.0f} % less error"
             for name, promise in self.promises.items()
         ]

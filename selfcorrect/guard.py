@@ -228,7 +228,7 @@ def guard(
     chosen = [pooled(size, partial(evidence.fold, i), count) for i in (0, 1)]
 
     def judged(rows: slice) -> tuple[Tensor, Tensor]:
-        """What the evidence of one fold alone would choose is judged by that of the other: the gain, with and without w."""
+        """What one fold's evidence alone would choose is judged by the other's: the gain, with and without w."""
         weights = [enlarged_rows(alpha, size, rows) for alpha in chosen]
         alpha = torch.where(evidence.first_fold(rows), weights[1], weights[0])
         gain = [taken_off(alpha, evidence.nd(i, rows)) for i in (0, 1)]

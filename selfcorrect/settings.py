@@ -178,7 +178,7 @@ class Settings:
     candidates: str = _setting(
         "none",
         "further denoised images, of the denoiser's other modes, that the guard may blend in: none; auto, those that a "
-        "few crops ask for; or all",
+        "few crops do not rule out; or all",
         "not in the paper; scripts/bench/quality.py measures it",
         choices=("none", "auto", "all"),
     )

@@ -85,8 +85,8 @@ def test_log() -> None:
     assert DENOISED.lines() == [
         "albedo: the same at every pixel; not used",
         "color: 3 pixels were NaN or infinite, 1 negative; repaired",
-        "candidate oidn:none: taken, a few crops promise 25 % less error",
-        "candidate oidn:fast: left out, a few crops promise 0 % less error",
+        "candidate oidn:none: taken, a few crops promise up to 25 % less error",
+        "candidate oidn:fast: left out, a few crops promise up to 0 % less error",
     ]
     assert WRITTEN.lines() == [
         "fireflies of one half were removed from 0.20% of the pixels, with 0.15% of the light; --fireflies keep leaves "
