@@ -10,7 +10,7 @@ on and the denoising passes (albedo, normal, depth) besides. Each half has half 
 What is changed for the render, and only for it (the file is never saved):
 
 - denoiser off, since selfcorrect denoises each half itself;
-- pixel filter: box, since a wider one correlates the noise of neighbours;
+- pixel filter: box, since a wider one correlates the noise of neighbours (``--filter keep`` leaves the scene's own);
 - adaptive sampling off: it stops where the samples happen to agree, which biases what the halves say of the noise;
 - sampling pattern tabulated Sobol, scrambling distance 1: blue noise and shared scrambling tie neighbouring pixels;
 - time limit, sample subset, samples per view layer, animated seed: off;
@@ -34,7 +34,6 @@ from halves import HALVES, add_arguments, path_of, published, seed_of
 
 CYCLES = {
     "use_denoising": False,
-    "pixel_filter_type": "BOX",
     "use_adaptive_sampling": False,
     "sampling_pattern": "TABULATED_SOBOL",
     "auto_scrambling_distance": False,
@@ -72,7 +71,14 @@ def _set(target: object, values: dict[str, object]) -> None:
             setattr(target, name, value)
 
 
-def prepare(scene: bpy.types.Scene, spp: int, size: tuple[int, int] | None = None, *, shot: bool = False) -> None:
+def prepare(
+    scene: bpy.types.Scene,
+    spp: int,
+    size: tuple[int, int] | None = None,
+    *,
+    shot: bool = False,
+    keep_filter: bool = False,
+) -> None:
     """Set a scene up for halves of ``spp`` samples each; for a ``shot`` also with motion, where Blender has it.
 
     Raises:
@@ -80,7 +86,7 @@ def prepare(scene: bpy.types.Scene, spp: int, size: tuple[int, int] | None = Non
     """
     if scene.render.engine != "CYCLES":
         raise RenderError(f"expected a scene rendered with Cycles, but got {scene.render.engine}; choose Cycles")
-    _set(scene.cycles, CYCLES)
+    _set(scene.cycles, CYCLES if keep_filter else CYCLES | {"pixel_filter_type": "BOX"})
     _set(scene.render, RENDER)
     _set(scene.render.image_settings, IMAGE)
     scene.cycles.samples = spp
@@ -116,7 +122,8 @@ def render_shot(options: argparse.Namespace) -> None:
     if options.file is not None:
         bpy.ops.wm.open_mainfile(filepath=str(options.file.resolve()))
     scene = _scene(options.scene_name)
-    prepare(scene, options.spp // 2, options.size, shot=len(options.frames or []) > 1)
+    keep_filter = options.filter == "keep"
+    prepare(scene, options.spp // 2, options.size, shot=len(options.frames or []) > 1, keep_filter=keep_filter)
     name = options.name or Path(bpy.data.filepath).stem or "untitled"
     for frame in options.frames or [None]:
         number = scene.frame_current if frame is None else frame
@@ -144,6 +151,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Render the two halves of a frame or a shot with Blender's Cycles.")
     parser.add_argument("file", type=Path, nargs="?", metavar="FILE.blend", help="left out where Blender has opened it")
     add_arguments(parser)
+    parser.add_argument("--filter", choices=("box", "keep"), default="box", help="of pixels; keep: the scene's own")
     parser.add_argument("--scene-name", metavar="SCENE", help="by default the one that was open when it was saved")
     own = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     return parser.parse_args(own)
