@@ -5,7 +5,8 @@ been. For the blend z + α (g − z) the error is a parabola in α whose two coe
 
     n = w (y^b − z^a)·(g^a − z^a),   d = w ‖g^a − z^a‖²,   w = 1 / (mean_rgb(z)² + 0.01)
 
-averaged over pixels and summed over both directions; its minimum is α = n / d. How α is found for several candidates
+averaged over pixels and summed over both directions; its minimum is α = n / d. Whether that is a gain is judged by
+other pixels than those that chose α: the fields of a chessboard. How α is found for several candidates
 and ever smaller tiles is in :mod:`selfcorrect.pooling`.
 
 The image is gone through in bands of rows (:mod:`selfcorrect.image.bands`): only n and d are kept for every pixel,
