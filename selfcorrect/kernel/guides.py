@@ -80,7 +80,7 @@ class Guides:
         def cut(term: Buffer) -> Tensor:
             part = there[term.name].index_select(0, rows).index_select(1, columns).permute(2, 0, 1)
             if term.kind == "radiance" and scale != 1.0:
-                return (part.double() * scale).clamp(-LARGEST, LARGEST).float()
+                return (part.double() * scale).clamp_(-LARGEST, LARGEST).float()
             return part.float() if part.dtype == torch.float16 else part
 
         planes = torch.cat([cut(term) for term in INPUTS if term.name in there]).clamp_(-LARGEST, LARGEST)
