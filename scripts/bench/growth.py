@@ -1,12 +1,13 @@
 """How training, inference and guard grow from 1080p to 8K: seconds, how busy the cores are, page faults, memory.
 
     .venv/bin/python scripts/bench/growth.py [--sizes 1920x1080 3840x2160 7680x4320] [--preset fast] [--steps 20]
-        [--threads 2] [--rounds 1] [--json]
+        [--threads 2] [--rounds 1] [--bare] [--json]
 
 Frames are the packaged one, mirrored until it fills the size: both halves and their denoised images alike, so that all
 sizes have the same mix of pixels. No files: images are in memory, as after reading and denoising. Each size is a
 process of its own. `busy` is CPU time over wall-clock time and threads; `system` the part of it that the kernel took
-(page faults); `peak` the process's, with the frame itself.
+(page faults); `peak` the process's, with the frame itself. --bare takes a window of one pixel and two layers, so that
+the kernels have next to nothing to do: what is left is what the stages do around them.
 """
 
 import argparse
@@ -41,6 +42,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--rounds", type=int, default=1, help="runs of each size, the quickest of every stage is told")
+    parser.add_argument("--bare", action="store_true", help="a window of one pixel and two layers")
     parser.add_argument("--json", action="store_true", help="measure the one size and print it as JSON")
     options = parser.parse_args()
     if options.json:
@@ -71,7 +73,15 @@ def size_of(text: str) -> Size:
 
 def in_a_process(size: Size, options: argparse.Namespace) -> dict[str, Any]:
     arguments = ["--sizes", f"{size[0]}x{size[1]}", "--preset", options.preset, "--steps", str(options.steps)]
-    script = [sys.executable, str(Path(__file__).resolve()), *arguments, "--threads", str(options.threads), "--json"]
+    script = [
+        sys.executable,
+        str(Path(__file__).resolve()),
+        *arguments,
+        "--threads",
+        str(options.threads),
+        "--json",
+        *(["--bare"] if options.bare else []),
+    ]
     ran = subprocess.run(script, stdout=subprocess.PIPE, text=True, check=True, cwd=Path(__file__).parent)
     found: dict[str, Any] = json.loads(ran.stdout)
     return found
@@ -103,7 +113,8 @@ class Meter:
 def measured(size: Size, options: argparse.Namespace) -> dict[str, Any]:
     """What each stage of one correction costs, as :func:`selfcorrect.correct` calls them."""
     torch.set_num_threads(options.threads)
-    settings = Settings.preset(options.preset, steps=options.steps)
+    bare = {"window": 1, "layers": 2} if options.bare else {}
+    settings = Settings.preset(options.preset, steps=options.steps, **bare)
     corrected(mirrored((256, 256)), settings)  # what is done once in a process
     stages = corrected(mirrored(size), settings)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
