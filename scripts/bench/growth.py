@@ -25,6 +25,7 @@ from torch import Tensor
 
 import denoisers
 from selfcorrect import Frame, Settings, files
+from selfcorrect.cli.memory import keep_freed
 from selfcorrect.guard import Evidence, guard, keep_light_
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.kernel.guides import mirror
@@ -113,6 +114,7 @@ class Meter:
 def measured(size: Size, options: argparse.Namespace) -> dict[str, Any]:
     """What each stage of one correction costs, as :func:`selfcorrect.correct` calls them."""
     torch.set_num_threads(options.threads)
+    keep_freed()  # as the command does
     bare = {"window": 1, "layers": 2} if options.bare else {}
     settings = Settings.preset(options.preset, steps=options.steps, **bare)
     corrected(mirrored((256, 256)), settings)  # what is done once in a process
