@@ -12,8 +12,8 @@ import importlib
 import importlib.util
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-from denoisers.host import Denoise, DualPlugin, Plugin
 from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
 __all__ = [
@@ -29,10 +29,20 @@ __all__ = [
     "variants",
 ]
 
+if TYPE_CHECKING:
+    from denoisers.host import Denoise, DualPlugin, Plugin
+
 PACKAGED = Path(__file__).resolve().parent / "weights" / "denoiser.onnx"
 """The project's own model: ``onnx`` without a path."""
 
 _MOST_THREADS = 1024
+
+
+def __getattr__(name: str) -> Any:
+    """What the host has, when it is asked for: it imports torch, for which names and help do not wait."""
+    if name in ("Denoise", "DualPlugin", "Plugin"):
+        return getattr(importlib.import_module("denoisers.host"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def names() -> tuple[str, ...]:
@@ -82,7 +92,7 @@ def variants(spec: str) -> tuple[str, ...]:
     return tuple(mode for mode in modes if mode != spec) if spec in modes else ()
 
 
-def create(spec: str, *, threads: int | None = None, scratch: int | None = None) -> Denoise:
+def create(spec: str, *, threads: int | None = None, scratch: int | None = None) -> "Denoise":
     """Create a denoiser from its specification.
 
     Args:
@@ -99,7 +109,8 @@ def create(spec: str, *, threads: int | None = None, scratch: int | None = None)
     """
     if threads is not None:
         check_threads(threads)
-    return Denoise(_plugin(spec, threads, scratch))
+    host: type[Denoise] = importlib.import_module("denoisers.host").Denoise
+    return host(_plugin(spec, threads, scratch))
 
 
 def check_threads(threads: int, name: str = "threads") -> None:
@@ -116,7 +127,7 @@ def check_threads(threads: int, name: str = "threads") -> None:
         raise SettingsError(f"expected {name} from 1 to {_MOST_THREADS}, but got {threads}")
 
 
-def _plugin(spec: str, threads: int | None, scratch: int | None) -> Plugin | DualPlugin:
+def _plugin(spec: str, threads: int | None, scratch: int | None) -> "Plugin | DualPlugin":
     plugin: Plugin | DualPlugin
     match spec.split(":", maxsplit=1):
         case ["oidn", *_]:

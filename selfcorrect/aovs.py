@@ -36,6 +36,7 @@ from selfcorrect.buffers import COLOR, FEATURES
 from selfcorrect.frame import Frame, checked, mean
 from selfcorrect.guard import Evidence, guard
 from selfcorrect.image.bands import average, bands, enlarged_rows, tile_means, widened
+from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.image.repair import Repairs
 
@@ -233,8 +234,8 @@ def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: 
         """‖x^a - x^b‖², relative."""
         alpha = enlarged_rows(guarded.alpha, size, rows)[0][:, :, None]
         a, b = (z[i][rows].double() + alpha * (y[i][rows].double() - z[i][rows].double()) for i in (0, 1))
-        squared = torch.where(there[rows], (a - b) ** 2, 0.0).mean(-1)
-        return (squared / ((scale * x[rows].double()).mean(-1) ** 2 + _DARKEST))[None]
+        squared = channel_mean(torch.where(there[rows], (a - b) ** 2, 0.0))
+        return (squared / (channel_mean(scale * x[rows].double()) ** 2 + _DARKEST))[None]
 
     (spread,) = average(tile_means(size[0], differences), size)
     return _Part(x, there, color, spread + _LEAST, darkest)

@@ -15,6 +15,7 @@ from torch import Tensor
 from selfcorrect.frame import Candidate, Frame, mean, prefiltered
 from selfcorrect.guard import Evidence
 from selfcorrect.image.bands import average, tile_means
+from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Scaled, scale_to_one
 from selfcorrect.image.tiles import Region
 
@@ -60,8 +61,8 @@ def _most(evidence: Evidence) -> float:
     def errors(rows: slice) -> Tensor:
         """n, d, and the error of the denoised halves: of both directions, by Eq. 6."""
         y, z, weight = evidence.y(rows), evidence.z(rows), [evidence.weight(i, rows) for i in (0, 1)]
-        crossed = sum(weight[i] * ((z[i] - y[1 - i]) ** 2).mean(-1) for i in (0, 1))
-        noise = (weight[0] + weight[1]) / 2 * ((y[0] - y[1]) ** 2).mean(-1)
+        crossed = sum(weight[i] * channel_mean((z[i] - y[1 - i]) ** 2) for i in (0, 1))
+        noise = (weight[0] + weight[1]) / 2 * channel_mean((y[0] - y[1]) ** 2)
         return torch.cat([evidence.both(rows), (crossed - noise)[None]])
 
     tiles = tile_means(evidence.size[0], errors)

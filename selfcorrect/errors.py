@@ -16,7 +16,7 @@ A message is one line: «expected X, but got Y», with the file and the channel 
 
 import re
 import unicodedata
-from importlib.metadata import requires
+from importlib import import_module
 
 __all__ = [
     "ChannelError",
@@ -24,9 +24,11 @@ __all__ = [
     "DeviceError",
     "FileError",
     "FrameError",
+    "MissingKernelsWarning",
     "MissingPackageError",
     "SelfcorrectError",
     "SettingsError",
+    "one_line",
     "out_of_memory",
     "packages_of",
     "printable",
@@ -40,9 +42,14 @@ def out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and bool(_NO_MEMORY.search(str(error))))
 
 
+def one_line(error: BaseException) -> str:
+    """The message of a library's error, without its line breaks."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def packages_of(extra: str) -> list[str]:
     """The packages of one of the project's extras, as pip takes them: that works wherever selfcorrect came from."""
-    lines = [line.partition(";") for line in requires("selfcorrect") or ()]
+    lines = [line.partition(";") for line in import_module("importlib.metadata").requires("selfcorrect") or ()]
     return [package.strip() for package, _, marker in lines if re.search(rf"""extra == ['"]{extra}['"]""", marker)]
 
 
@@ -97,3 +104,7 @@ class MissingPackageError(SelfcorrectError):
     def __init__(self, purpose: str, extra: str):
         packages = " ".join(f"'{package}'" for package in packages_of(extra))
         super().__init__(f"{purpose} needs a package that is not installed; run: pip install {packages}")
+
+
+class MissingKernelsWarning(UserWarning):
+    """The compiled kernels are not installed: the reference in plain torch runs instead, which is much slower."""

@@ -18,9 +18,10 @@ from selfcorrect.errors import ChannelError, FileError, FrameError, SettingsErro
 from selfcorrect.exr.aovs import Plan, plan
 from selfcorrect.exr.limits import check_alike
 from selfcorrect.exr.passes import Others, means, picture
-from selfcorrect.exr.view_layers import ALL, chosen, view_layers
+from selfcorrect.exr.view_layers import chosen, view_layers
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
+from selfcorrect.settings import ALL_LAYERS
 
 __all__ = [
     "Images",
@@ -69,10 +70,10 @@ class Sources:
             FileError: a file cannot be read.
             ChannelError: a layer that is named is not in every file.
         """
-        if "color" in (self.mapping or {}) and wanted == ALL:
+        if "color" in (self.mapping or {}) and wanted == ALL_LAYERS:
             return [("", self)], []
         names, lines = chosen(self.a, self.b, wanted)
-        if len(names) == 1 and (wanted == ALL or "::" in self.a):
+        if len(names) == 1 and (wanted == ALL_LAYERS or "::" in self.a):
             return [(names[0], self)], list(lines)
         given = [path for path in (self.denoised_a, self.denoised_b, self.denoised_full) if path]
         lacking = {
@@ -80,7 +81,7 @@ class Sources:
         }
         if any(lacking.values()) and len(names) > 1:
             path, absent = next((path, absent) for path, absent in lacking.items() if absent)
-            if wanted != ALL:
+            if wanted != ALL_LAYERS:
                 raise ChannelError(
                     f"{path}: expected the view layers of --layers {wanted}, but got none named {', '.join(absent)}; "
                     "leave them out of --layers"

@@ -35,6 +35,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from selfcorrect.image.bands import TILE, bands, enlarged_rows, shares, tile_means, widened
+from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Radiance
 
 __all__ = ["Removed", "Rule", "remove_fireflies_"]
@@ -44,6 +45,7 @@ _GROWN = 2  # pixels
 _WITNESS = 5  # side of the window of noisy pixels
 _SPOT = 4  # pixels from a spot's brightest part
 _REACH = 2 * _GROWN + 3 * _SPOT + 1
+_ROWS = 128  # worked on at a time, with _REACH more on either side
 _MOST_PIXELS = 2**20  # that tell what is bright, in rows spread evenly over the frame
 _STRICTER = 2.0  # each time too much would go, the threshold is multiplied by this
 _TRIES = 5
@@ -116,9 +118,9 @@ def remove_fireflies_(
     """
     rule = rule or Rule()
     found = _Search(color, denoised, scale, rule)
-    before = _mean(image, lambda rows: image[rows].double().mean(-1))
+    before = _mean(image, lambda rows: channel_mean(image[rows].double()))
     for _ in range(_TRIES):
-        taken = _mean(image, lambda rows: found.excess(image, rows).mean(-1))
+        taken = _mean(image, lambda rows: channel_mean(found.excess(image, rows)))
         if taken <= rule.most * before:
             break
         found.stricter *= _STRICTER
@@ -130,13 +132,13 @@ def remove_fireflies_(
     def errors(rows: slice) -> Tensor:
         excess = found.excess(denoised_full, rows)
         left = denoised_full[rows].double() - excess
-        return ((excess**2).mean(-1) / (left.mean(-1) ** 2 + 0.01))[None]
+        return (channel_mean(excess**2) / (channel_mean(left) ** 2 + 0.01))[None]
 
     count = image.shape[0] * image.shape[1]
-    spots = tile_means(image.shape[0], errors)
+    spots = tile_means(image.shape[0], errors, band=_ROWS)
     spots = spots[0] * shares(spots, (image.shape[0], image.shape[1])) * (TILE**2 / count)
     pixels = 0.0
-    for rows in bands(image.shape[0]):
+    for rows in bands(image.shape[0], _ROWS):
         excess = found.excess(image, rows)
         pixels += float((excess > 0).any(-1).sum())
         image[rows] = image[rows].double() - excess
@@ -159,7 +161,7 @@ class _Search:
 
     def _means(self, images: Pair, rows: slice) -> tuple[Tensor, Tensor]:
         """m of both halves, (rows, W) each."""
-        a, b = (half[rows].double().mean(-1) * self._scale for half in images)
+        a, b = (channel_mean(half[rows].double()) * self._scale for half in images)
         return a, b
 
     def _disagreement(self, rows: slice) -> Tensor:
@@ -169,7 +171,9 @@ class _Search:
 
     def _usual_brightness(self) -> float:
         step = max(math.ceil(self._size[0] * self._size[1] / _MOST_PIXELS), 1)
-        seen = [torch.minimum(*self._means(self._denoised, rows))[::step].flatten() for rows in bands(self._size[0])]
+        seen = [
+            torch.minimum(*self._means(self._denoised, rows))[::step].flatten() for rows in bands(self._size[0], _ROWS)
+        ]
         return float(torch.cat(seen).quantile(self._rule.usual))
 
     def weight(self, rows: slice) -> Tensor:
@@ -179,6 +183,8 @@ class _Search:
         spread = enlarged_rows(self._spread, self._size, wide)[0]
         threshold = self.stricter * (self._rule.spreads * spread).clamp(min=math.log(self._rule.least))
         found = (self._disagreement(wide) > threshold) & (torch.minimum(a, b) <= self._usual)
+        if not found.any():  # most bands of most frames; what follows is dear
+            return torch.zeros_like(a)[inner]
         found &= self._contradicted(a, b, wide)
         light = self._met_by_both(a, b, wide) & found | self._met_by_many(found, a, b, wide)
         found &= _largest_around(light, _SPOT) == 0
@@ -231,14 +237,14 @@ def _mean_around(values: Tensor, reach: int) -> Tensor:
 
 
 def _mean(image: Tensor, pixels: Rows) -> float:
-    total = sum(float(pixels(rows).sum()) for rows in bands(image.shape[0]))
+    total = sum(float(pixels(rows).sum()) for rows in bands(image.shape[0], _ROWS))
     return total / (image.shape[0] * image.shape[1])
 
 
 def _tile_quantiles(size: tuple[int, int], pixels: Rows, share: float) -> Tensor:
     """Of a map, over tiles of 16 pixels, (h, w); border tiles are filled up with the edge's pixels."""
     strips = []
-    for rows in bands(size[0]):
+    for rows in bands(size[0], _ROWS):
         values = pixels(rows)
         below, right = -values.shape[0] % TILE, -values.shape[1] % TILE
         padded = F.pad(values[None], (0, right, 0, below), mode="replicate")[0]

@@ -27,6 +27,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
+from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Radiance
 from selfcorrect.pooling import pairs, pooled, taken_off
 
@@ -167,7 +168,7 @@ class Evidence:
                 products = [residual * change for change in changes]
                 products += [changes[k] * changes[m] for k, m in pairs(self.candidates)]
                 for plane, product in enumerate(products):
-                    self._nd[i, plane, band] = weight * product.mean(-1)
+                    self._nd[i, plane, band] = weight * channel_mean(product)
 
     def y(self, rows: slice) -> list[Tensor]:
         """The noisy halves."""
@@ -206,11 +207,11 @@ class Evidence:
         for its own radiance, but at most for the usual one around it.
         """
         usual = enlarged_rows(self._usual[i], self.size, rows)[0].exp()
-        return 1.0 / (torch.minimum(self.denoised[i][rows].double().mean(-1), usual) ** 2 + 0.01)
+        return 1.0 / (torch.minimum(channel_mean(self.denoised[i][rows].double()), usual) ** 2 + 0.01)
 
 
 def _log_level(radiance: Radiance, rows: slice) -> Tensor:
-    return radiance[rows].double().mean(-1).clamp(min=_DARKEST).log()[None]
+    return channel_mean(radiance[rows].double()).clamp(min=_DARKEST).log()[None]
 
 
 def guard(
@@ -255,10 +256,10 @@ def guard(
     def squares(rows: slice) -> Tensor:
         """Mean squared differences, and the gain, by which :func:`_estimate` knows errors."""
         y, z, full = evidence.y(rows), evidence.z(rows), denoised_full[rows].double()
-        between = ((y[0] - y[1]) ** 2).mean(-1)
-        crossed = ((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2).mean(-1) / 2
-        spread = ((z[0] - z[1]) ** 2).mean(-1)
-        nonlinear = (((z[0] + z[1]) / 2 - full) ** 2).mean(-1)
+        between = channel_mean((y[0] - y[1]) ** 2)
+        crossed = channel_mean((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2) / 2
+        spread = channel_mean((z[0] - z[1]) ** 2)
+        nonlinear = channel_mean(((z[0] + z[1]) / 2 - full) ** 2)
         gained = judged(rows)[1] if improved else torch.zeros_like(spread)
         # The best image there is says what errors are relative to: where the denoiser has left fireflies or blurred
         # a lamp, its own radiance would hide its error.
@@ -270,7 +271,7 @@ def guard(
 
 def _metric_weight(radiance: Tensor, scale: float) -> Tensor:
     """relMSE's 1 / (mean_rgb² + 0.01) of the frame in its own units, times 1 / scale²."""
-    return 1.0 / (radiance.mean(-1) ** 2 + 0.01 * scale**2)
+    return 1.0 / (channel_mean(radiance) ** 2 + 0.01 * scale**2)
 
 
 def _shown(image: Tensor, rows: slice) -> Tensor:
@@ -340,8 +341,8 @@ def keep_light_(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:
     size = (image.shape[0], image.shape[1])
 
     def means(rows: slice) -> Tensor:
-        a, b = (half[rows].double().mean(-1) for half in color)
-        shown = (x[rows].double().mean(-1) for x in (image, denoised))
+        a, b = (channel_mean(half[rows].double()) for half in color)
+        shown = (channel_mean(x[rows].double()) for x in (image, denoised))
         return torch.stack([*shown, (a + b) / 2, ((a - b) / 2) ** 2])
 
     mean, kept, target, variance = average(tile_means(size[0], means), size)
@@ -356,7 +357,7 @@ def keep_light_(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:
         for rows in bands(size[0]):
             returned = share * enlarged_rows(lost, size, rows).permute(1, 2, 0)
             image[rows] = (image[rows].double() + returned).clamp(min=0)
-        (mean,) = average(tile_means(size[0], lambda rows: image[rows].double().mean(-1)[None]), size)
+        (mean,) = average(tile_means(size[0], lambda rows: channel_mean(image[rows].double())[None]), size)
     scale = min(max(wanted / mean, 1 / _LARGEST_SCALE), _LARGEST_SCALE)
     for rows in bands(size[0]):
         image[rows] = image[rows].double() * scale

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from selfcorrect.frame import Frame
 from selfcorrect.image.bands import average, tile_means
+from selfcorrect.image.channels import channel_mean
 
 __all__ = ["Dependence", "dependence", "doubts", "neighbour_correlation"]
 
@@ -149,7 +150,7 @@ def _coefficients(a: Tensor, b: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Te
     cosines = torch.cos((order + 0.5) * order[:, None] * math.pi / _BLOCK) / math.sqrt(_BLOCK / 2)
 
     def one(half: Tensor) -> tuple[Tensor, Tensor]:
-        strips = [half[top : top + _TILE, :width].double().mean(-1) for top in range(0, height, step * _TILE)]
+        strips = [channel_mean(half[top : top + _TILE, :width].double()) for top in range(0, height, step * _TILE)]
         if not (strips and width):
             nothing = half.new_zeros(0, 16, 3, dtype=torch.float64)
             return nothing, nothing[..., :1]
@@ -169,7 +170,7 @@ def _usual(a: Tensor, b: Tensor) -> float:
     size = (a.shape[0], a.shape[1])
 
     def roots(rows: slice) -> Tensor:
-        return torch.stack([half[rows].double().mean(-1).clamp(min=0).sqrt() for half in (a, b)])
+        return torch.stack([channel_mean(half[rows].double()).clamp(min=0).sqrt() for half in (a, b)])
 
     root = sum(average(tile_means(size[0], roots), size)) / 2
     return _DARK * root**2 if root > 0 else 1.0
@@ -180,7 +181,7 @@ def neighbour_correlation(a: Tensor, b: Tensor) -> float:
 
     The difference of the halves is noise and nothing else; signs, because a few fireflies would decide a covariance.
     """
-    sign = (a - b).mean(-1).sign()
+    sign = channel_mean(a - b).sign()
     pairs = torch.cat([(sign[:, 1:] * sign[:, :-1]).flatten(), (sign[1:] * sign[:-1]).flatten()])
     used = pairs[pairs != 0]
     return float(used.mean()) if len(used) else 0.0

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from selfcorrect.errors import FrameError
+from selfcorrect.image.channels import channel_mean
 
 __all__ = [
     "Comparison",
@@ -225,8 +226,8 @@ def temporal_error(
         for name, pair in (("reference", reference), ("reference_b", reference_b))
     )
     given = [(a[i] + b[i]) / 2 for i in (0, 1)] if weight is None else [_radiance("weight", s, like=x) for s in weight]
-    level = sum(s.mean(dim=-1) ** 2 for s in given) / 2 + 0.01
-    errors = ((change - (a[0] - a[1])) * (change - (b[0] - b[1]))).mean(dim=-1) / level
+    level = sum(channel_mean(s) ** 2 for s in given) / 2 + 0.01
+    errors = channel_mean((change - (a[0] - a[1])) * (change - (b[0] - b[1]))) / level
     return float(errors.mean())
 
 
@@ -345,7 +346,7 @@ def _relative_error(
     r_a = _radiance("reference", reference, like=x)
     r_b = r_a if reference_b is None else _radiance("reference_b", reference_b, like=x)
     s = (r_a + r_b) / 2 if weight is None else _radiance("weight", weight, like=x)
-    return ((x - r_a) * (x - r_b)).mean(dim=-1) / (s.mean(dim=-1) ** 2 + 0.01)
+    return channel_mean((x - r_a) * (x - r_b)) / (channel_mean(s) ** 2 + 0.01)
 
 
 def _resampled_means(errors: Tensor, seed: int | torch.Generator) -> Tensor:

@@ -3,11 +3,11 @@
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from selfcorrect.errors import SettingsError
 
-__all__ = ["STAGE_NAMES", "Settings", "seconds"]
+__all__ = ["ALL_LAYERS", "COMBINE_KERNELS", "EXTRA_FLAGS", "STAGE_NAMES", "ExtraFlag", "Settings", "seconds"]
 
 _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench/quality.py measures it"
@@ -74,6 +74,37 @@ def _check(name: str, value: object, kind: type, metadata: Mapping[str, Any]) ->
 
 
 STAGE_NAMES = ("regression", "core", "james-stein", "neural-james-stein", "deep-combiner", "deep-combiner-4")
+
+
+ALL_LAYERS = "all"
+"""Instead of names of view layers: every one that both halves have."""
+
+COMBINE_KERNELS = ("uncorrelated", "cross-weighting", "uniform")
+"""Weights of the command ``combine``, the default first."""
+
+
+class ExtraFlag(NamedTuple):
+    """The flag by which the command ``frame`` takes images beyond the halves for a stage.
+
+    Attributes:
+        flag: its name.
+        files: what help calls each.
+        help: of the flag.
+    """
+
+    flag: str
+    files: tuple[str, ...]
+    help: str
+
+
+EXTRA_FLAGS = {
+    "deep-combiner-4": ExtraFlag(
+        "--sub-images",
+        ("A1.exr", "A2.exr", "B1.exr", "B2.exr"),
+        "the two renders whose mean is half a, and those of half b, for the stage deep-combiner-4",
+    )
+}
+"""By name of the stage; here, as help must not wait for what stages import."""
 
 
 def _check_stages(stages: str) -> None:

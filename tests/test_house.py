@@ -11,7 +11,7 @@ import selfcorrect
 
 PACKAGE = Path(selfcorrect.__file__).parent
 ORDER = (
-    {"errors", "publish", "buffers", "settings", "start", "words"},
+    {"errors", "publish", "buffers", "settings", "start", "words", "output"},
     {"image"},
     {"kernel"},
     {"frame", "exr"},

@@ -1,27 +1,23 @@
 """The command. Nothing outside this package prints: results go to stdout, everything else to stderr."""
 
+import argparse
 import warnings
 from collections.abc import Sequence
-from importlib.metadata import version
+from importlib import import_module
+from typing import Any
 
-from selfcorrect import start
-from selfcorrect.cli import bench, combine, compare, completion, demo, frame, inspect, report, sequence, settings
+from selfcorrect.cli import commands
 from selfcorrect.cli.help import Parser
-from selfcorrect.cli.terminal import log, terminable
-from selfcorrect.errors import SelfcorrectError, out_of_memory
-from selfcorrect.exr.file import one_line
-from selfcorrect.kernel.compiled import MissingKernelsWarning
+from selfcorrect.cli.terminal import log, show, terminable
+from selfcorrect.errors import MissingKernelsWarning, SelfcorrectError, one_line, out_of_memory
 
 __all__ = ["main"]
-
-_COMMANDS = (frame, sequence, bench, inspect, compare, report, combine, settings, demo, completion)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code is 0, 1 where frames of a shot failed, 2 for input that the user can fix."""
     warnings.simplefilter("ignore", MissingKernelsWarning)  # the runner tells of it, in a line of the log
     try:
-        start.begun()
         options = _parser().parse_args(arguments)
         with terminable():
             failed: int | None = options.run(options)
@@ -43,10 +39,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if failed else 0
 
 
+class _Version(argparse.Action):
+    """Looks the version up when it is asked for: what reads it is slow to import."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        show(f"selfcorrect {import_module('importlib.metadata').version('selfcorrect')}")
+        parser.exit()
+
+
 def _parser() -> Parser:
     parser = Parser(prog="selfcorrect", description="Gives denoised Monte Carlo renders their detail back.")
-    parser.add_argument("--version", action="version", version=f"selfcorrect {version('selfcorrect')}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in _COMMANDS:
-        command.add(commands)
+    parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
+    commands.add(parser.add_subparsers(required=True, metavar="COMMAND"))
     return parser

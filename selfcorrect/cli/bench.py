@@ -17,37 +17,13 @@ from selfcorrect.publish import publish
 from selfcorrect.settings import Settings
 from selfcorrect.tradeoff import Measurement, Point
 
-__all__ = ["add"]
+__all__ = ["run"]
 
 _ERROR = "estimated relMSE over that of the denoised image"
 
 
-def add(commands: Any) -> None:
-    """Add the command to argparse's subparsers."""
-    parser = commands.add_parser(
-        "bench",
-        usage="%(prog)s A.exr B.exr [flags]",
-        help="what each second buys on this frame, and the preset to take",
-    )
-    halves.add(parser)
-    parser.add_argument(
-        "--points",
-        nargs="+",
-        action="extend",
-        metavar="POINT",
-        help="try these: presets, base (the settings given), SETTING=VALUE,…, PRESET:SETTING=VALUE,…",
-    )
-    parser.add_argument(
-        "--previous", nargs=2, metavar=("A.exr", "B.exr"), help="the frame before: also try a warm start from it"
-    )
-    parser.add_argument("--csv", metavar="OUT.csv", help="keep the measurements here, after each point")
-    parser.add_argument("--plot", metavar="OUT.png", help="seconds against error (needs the extra bench)")
-    pages.add_flag(parser)
-    flags.add_run_flags(parser)
-    parser.set_defaults(run=_bench)
-
-
-def _bench(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> None:
+    """Run the command."""
     halves.check(options)
     if options.diagnostics:
         raise SettingsError("expected no --diagnostics with bench, which writes no image, but got one")

@@ -2,7 +2,6 @@
 
 import argparse
 import math
-from typing import Any
 
 from selfcorrect import exr, metrics
 from selfcorrect.cli import memory
@@ -11,28 +10,11 @@ from selfcorrect.cli.terminal import answer, log, show
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.exr.limits import check_alike
 
-__all__ = ["add"]
+__all__ = ["run"]
 
 
-def add(commands: Any) -> None:
-    """Add the command to argparse's subparsers."""
-    parser = commands.add_parser("compare", help="error of an image against one or two references")
-    parser.add_argument("image", metavar="IMAGE.exr", help="what is compared")
-    parser.add_argument("reference", metavar="REF.exr", help="what it should be")
-    parser.add_argument("reference_b", metavar="REF2.exr", nargs="?", help="an independent second reference")
-    parser.add_argument("--weight", metavar="SMOOTH.exr", help="smooth reference for the weight of relMSE")
-    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
-    parser.add_argument(
-        "--shot",
-        action="store_true",
-        help="names hold #### for the frame number: errors of every frame and of the change from frame to frame",
-    )
-    parser.add_argument("--maxmem", metavar="SIZE", help="refuse images that need more memory, such as 6G")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    parser.set_defaults(run=_compare)
-
-
-def _compare(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> None:
+    """Run the command."""
     if not -(2**63) <= options.seed < 2**63:
         raise SettingsError(f"expected a --seed of 64 bits, but got {options.seed}")
     if options.shot:

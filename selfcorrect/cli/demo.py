@@ -12,18 +12,11 @@ from selfcorrect.cli.frame import correct_files
 from selfcorrect.cli.terminal import answer, show
 from selfcorrect.frame import Frame
 
-__all__ = ["add"]
+__all__ = ["run"]
 
 
-def add(commands: Any) -> None:
-    """Add the command to argparse's subparsers."""
-    parser = commands.add_parser("demo", help="correct the packaged frame and show what was gained")
-    parser.add_argument("-o", "--output", metavar="DIR", help="keep the images here")
-    flags.add_run_flags(parser)
-    parser.set_defaults(run=_demo)
-
-
-def _demo(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> None:
+    """Run the command."""
     with resources.as_file(resources.files("selfcorrect") / "data") as data, tempfile.TemporaryDirectory() as away:
         folder = Path(options.output or away)
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,6 @@
 
 import argparse
 import tomllib
-from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,19 +9,19 @@ from typing import Any
 import denoisers
 from selfcorrect.cli.help import Expert, add_help_all
 from selfcorrect.errors import FileError, SettingsError
-from selfcorrect.exr.view_layers import ALL
-from selfcorrect.settings import Settings, seconds
-from selfcorrect.stages import STAGES
-from selfcorrect.stages.stage import Extra
+from selfcorrect.settings import ALL_LAYERS, EXTRA_FLAGS, ExtraFlag, Settings, seconds
 
 __all__ = [
     "add_aovs",
     "add_extra",
+    "add_halves",
     "add_layers",
     "add_maxmem",
     "add_preset",
+    "add_report",
     "add_run_flags",
     "add_settings",
+    "check",
     "denoised",
     "extra_files",
     "mapping",
@@ -49,10 +48,25 @@ def add_layers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--layers",
         dest="view_layers",
-        default=ALL,
+        default=ALL_LAYERS,
         metavar="NAME,NAME",
         help="view layers, or views, to correct; by default all of the files'",
     )
+
+
+def add_halves(parser: argparse.ArgumentParser, *, alone: bool = True) -> None:
+    """A frame's two halves, and their denoised images where the user has them; ``alone``: no file comes after them."""
+    parser.add_argument("a", metavar="A.exr", help="half a; FILE.exr::LAYER chooses a layer")
+    count = argparse.OPTIONAL if alone else None  # halves.check() says more of a missing half than argparse would
+    parser.add_argument("b", metavar="B.exr", nargs=count, help="half b, rendered with another seed")
+    parser.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
+    parser.add_argument("--denoised-b", metavar="DB.exr", help="denoised half b")
+    parser.add_argument("--denoised", dest="denoised_full", metavar="D.exr", help="denoised mean of both halves")
+
+
+def add_report(parser: argparse.ArgumentParser) -> None:
+    """The flag --report."""
+    parser.add_argument("--report", metavar="PAGE.html", help="also write a page to look at, for any browser")
 
 
 def add_maxmem(parser: argparse.ArgumentParser) -> None:
@@ -67,7 +81,7 @@ def add_maxmem(parser: argparse.ArgumentParser) -> None:
 
 def add_extra(parser: argparse.ArgumentParser) -> None:
     """Images beyond the halves that a stage needs."""
-    for _, extra in _extras():
+    for extra in EXTRA_FLAGS.values():
         parser.add_argument(extra.flag, nargs=len(extra.files), metavar=extra.files, help=Expert(extra.help))
 
 
@@ -124,6 +138,20 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         if isinstance(f.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
         parser.add_argument(_flag(f.name), dest=f.name, default=None, help=shown(f.metadata["help"]), **how)
+
+
+def check(options: argparse.Namespace) -> None:
+    """Raise what flags alone have wrong, before anything slow is imported to find it.
+
+    Raises:
+        SettingsError: a setting, the threads, a --map, or an image that a stage lacks.
+        FileError: the file of settings cannot be read.
+    """
+    settings = settings_of(options)
+    if options.threads is not None:
+        denoisers.check_threads(options.threads, "--threads")
+    mapping(options)
+    extra_files(options, settings)
 
 
 def settings_of(options: argparse.Namespace) -> Settings:
@@ -193,7 +221,7 @@ def extra_files(options: argparse.Namespace, settings: Settings) -> dict[str, li
         SettingsError: a stage lacks what it needs, or a flag was given without its stage.
     """
     found = {}
-    for stage, extra in _extras():
+    for stage, extra in EXTRA_FLAGS.items():
         named, wanted = getattr(options, _destination(extra), None), stage in settings.stage_names
         if wanted and not named:
             usage = " ".join((extra.flag, *extra.files))
@@ -205,11 +233,7 @@ def extra_files(options: argparse.Namespace, settings: Settings) -> dict[str, li
     return found
 
 
-def _extras() -> Iterator[tuple[str, Extra]]:
-    return ((name, stage.extra) for name, stage in STAGES.items() if stage.extra is not None)
-
-
-def _destination(extra: Extra) -> str:
+def _destination(extra: ExtraFlag) -> str:
     return extra.flag.removeprefix("--").replace("-", "_")
 
 

@@ -4,37 +4,23 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 from selfcorrect import exr, files
 from selfcorrect.cli import flags, halves, memory, pages
 from selfcorrect.cli.runner import Corrected, Runner
 from selfcorrect.cli.terminal import EndOnInterrupt, answer, log
 from selfcorrect.errors import SettingsError
-from selfcorrect.exr.view_layers import ALL
 from selfcorrect.facts import Written
 from selfcorrect.frame import Frame
 from selfcorrect.publish import remove_abandoned
+from selfcorrect.settings import ALL_LAYERS
 
-__all__ = ["add", "correct_files"]
-
-
-def add(commands: Any) -> None:
-    """Add the command to argparse's subparsers."""
-    parser = commands.add_parser("frame", usage="%(prog)s A.exr B.exr -o OUT.exr [flags]", help="correct one frame")
-    halves.add(parser)
-    flags.add_extra(parser)
-    parser.add_argument("-o", "--output", metavar="OUT.exr", help="half a with its colour corrected")
-    flags.add_maxmem(parser)
-    pages.add_flag(parser)
-    flags.add_aovs(parser)
-    flags.add_layers(parser)
-    flags.add_run_flags(parser)
-    parser.set_defaults(run=_frame)
+__all__ = ["correct_files", "run"]
 
 
-def _frame(options: argparse.Namespace) -> None:
-    halves.check(options, "output")
+def run(options: argparse.Namespace) -> None:
+    """Run the command."""
+    halves.check(options)
     sources = files.Sources(
         options.a, options.b, **flags.denoised(options), mapping=flags.mapping(options), aovs=options.aovs
     )
@@ -59,7 +45,7 @@ def correct_files(
     """Correct one frame from files to file; ``show`` is called with the denoised frame, ``gather`` with it and the
     result.
     """
-    layers, told = sources.of_layers(getattr(options, "view_layers", ALL))
+    layers, told = sources.of_layers(getattr(options, "view_layers", ALL_LAYERS))
     log(*told)
     extra = sum(len(paths) for paths in flags.extra_files(options, flags.settings_of(options)).values())
     if extra and len(layers) > 1:

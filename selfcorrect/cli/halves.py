@@ -6,46 +6,31 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from selfcorrect.errors import FileError, SettingsError
+from selfcorrect.errors import FileError
 from selfcorrect.exr import channels
 from selfcorrect.exr.file import headers
 
-__all__ = ["add", "check"]
+__all__ = ["check"]
 
 _HALF_A = re.compile(r"(?<![a-z])a(?![a-z])", re.IGNORECASE)
 _NUMBER = re.compile(r"\d+(?=\.exr$)", re.IGNORECASE)
 _ANOTHER_SEED = "render the frame twice, with half of the samples and another seed each"
 
 
-def add(parser: argparse.ArgumentParser, *, alone: bool = True) -> None:
-    """A frame's two halves, and their denoised images where the user has them; ``alone``: no file comes after them."""
-    parser.add_argument("a", metavar="A.exr", help="half a; FILE.exr::LAYER chooses a layer")
-    count = argparse.OPTIONAL if alone else None  # check() says more of a missing half than argparse would
-    parser.add_argument("b", metavar="B.exr", nargs=count, help="half b, rendered with another seed")
-    parser.add_argument("--denoised-a", metavar="DA.exr", help="denoised half a, instead of a denoiser")
-    parser.add_argument("--denoised-b", metavar="DB.exr", help="denoised half b")
-    parser.add_argument("--denoised", dest="denoised_full", metavar="D.exr", help="denoised mean of both halves")
-
-
-def check(options: argparse.Namespace, *also: str) -> None:
+def check(options: argparse.Namespace) -> None:
     """Raise where there are not two halves, or one is a folder, and say what to give instead.
 
     Args:
-        options: what the flags of :func:`add` gave.
-        also: what else must be given: names of options.
+        options: what the flags of :func:`selfcorrect.cli.flags.add_halves` gave.
 
     Raises:
         FileError: half b is missing, or a half is a folder.
-        SettingsError: one of ``also`` is missing.
     """
     for path in (options.a, options.b):
         if path is not None and Path(path).is_dir():
             raise FileError(f"{path}: expected half a and half b, but got a folder; {_in_folder(Path(path))}")
     if options.b is None:
         raise FileError(f"{options.a}: expected half a and half b, but got one file; {_in_file(options.a)}")
-    for name in also:
-        if getattr(options, name) is None:
-            raise SettingsError(f"expected --{name}, but got none; see --help")
 
 
 def _in_folder(folder: Path) -> str:

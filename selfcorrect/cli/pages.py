@@ -1,6 +1,5 @@
 """Pages to look at (:mod:`selfcorrect.report`), gathered while frames are in memory."""
 
-import argparse
 import contextlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,18 +17,13 @@ from selfcorrect.report.shot import looked_at
 from selfcorrect.settings import Settings
 from selfcorrect.shot.run import Outcome
 
-__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "add_flag", "facts_of", "images_of", "target", "write"]
+__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "facts_of", "images_of", "target", "write"]
 
 MAPS = ("error.before", "error.after", "blend")
 """Of a result's maps, in the order of the page."""
 
 Gather = Callable[[Frame, Result], None]
 """Called with a denoised frame and what was made of it."""
-
-
-def add_flag(parser: argparse.ArgumentParser) -> None:
-    """The flag --report."""
-    parser.add_argument("--report", metavar="PAGE.html", help="also write a page to look at, for any browser")
 
 
 def target(path: str | None) -> Path | None:

@@ -8,34 +8,20 @@ from torch import Tensor
 
 import denoisers
 from selfcorrect import exr, files, metrics, report
-from selfcorrect.cli import flags, halves, pages
+from selfcorrect.cli import flags, pages
 from selfcorrect.cli.terminal import log
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.frame import Frame
 from selfcorrect.image.repair import repaired
 
-__all__ = ["add"]
+__all__ = ["run"]
 
 _AGAIN = tuple(name for name in denoisers.names() if ":" not in name)
 """What may run because a file names it: no command and no code of anyone's."""
 
 
-def add(commands: Any) -> None:
-    """Add the command to argparse's subparsers."""
-    parser = commands.add_parser("report", help="a page to look at a corrected frame, for any browser")
-    halves.add(parser, alone=False)
-    parser.add_argument(
-        "corrected", metavar="OUT.exr", help="what `selfcorrect frame` wrote; with --diagnostics, it has maps"
-    )
-    parser.add_argument("-o", "--output", required=True, metavar="PAGE.html", help="the page")
-    parser.add_argument("--reference", metavar="REF.exr", help="a reference to look at and to measure against")
-    parser.add_argument("--denoiser", metavar="NAME", help="who denoises again; by default who did it for OUT.exr")
-    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads of the denoiser, by default all")
-    parser.add_argument("--map", action="append", default=[], metavar="ROLE=CHANNEL", help="albedo=MyAlbedo, …")
-    parser.set_defaults(run=_report)
-
-
-def _report(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> None:
+    """Run the command."""
     page = exr.check_target(options.output, ".html")
     sources = files.Sources(options.a, options.b, **flags.denoised(options), mapping=flags.mapping(options))
     loaded, out = files.load(sources), exr.load_half(options.corrected)

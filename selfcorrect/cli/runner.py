@@ -15,6 +15,7 @@ from selfcorrect.aov_channels import correct_channels
 from selfcorrect.aovs import denoiser_of
 from selfcorrect.candidates import with_candidates
 from selfcorrect.cli import flags
+from selfcorrect.cli.memory import keep_freed
 from selfcorrect.cli.terminal import Progress, log
 from selfcorrect.correct import COLOR_OUTPUT, Result, correct
 from selfcorrect.errors import MissingPackageError, SettingsError
@@ -297,6 +298,7 @@ def _outputs(result: Result, diagnostics: list[str]) -> dict[str, Any]:
 
 
 def _use_machine(options: argparse.Namespace) -> None:
+    keep_freed()
     if options.threads is not None:
         check_threads(options.threads, "--threads")
         torch.set_num_threads(options.threads)

@@ -5,7 +5,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from selfcorrect import files
 from selfcorrect.cli import flags, memory, pages
@@ -19,37 +18,10 @@ from selfcorrect.shot.framerange import parse_frames
 from selfcorrect.shot.state import load_state
 from selfcorrect.stages.core.network import Network
 
-__all__ = ["add"]
+__all__ = ["run"]
 
 
-def add(commands: Any) -> None:
-    """Add the command to argparse's subparsers."""
-    parser = commands.add_parser("sequence", help="correct the frames of a shot, each from the last one's network")
-    parser.add_argument("a", metavar="A.####.exr", help="half a; #### or %%04d stands for the frame number")
-    parser.add_argument("b", metavar="B.####.exr", help="half b, rendered with another seed")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.####.exr", help="one for each frame")
-    parser.add_argument("--frames", required=True, metavar="RANGE", help="1-240, 1-240x2, 1-3,5,7-20:2, …")
-    parser.add_argument("--denoised-a", metavar="DA.####.exr", help="denoised half a, instead of a denoiser")
-    parser.add_argument("--denoised-b", metavar="DB.####.exr", help="denoised half b")
-    parser.add_argument("--denoised-full", metavar="D.####.exr", help="denoised mean of both halves")
-    parser.add_argument(
-        "--skip-existing", action="store_true", help="leave out frames whose output is whole and made the same way"
-    )
-    parser.add_argument("--cold", action="store_true", help="no frame starts from the one before")
-    parser.add_argument("--warm-start", metavar="STATE", help="state that the first frame starts from")
-    parser.add_argument(
-        "--save-state", metavar="STATE.safetensors", help="keep the last frame's state here; with ####, that of each"
-    )
-    parser.add_argument("--fail-fast", action="store_true", help="end with the first frame that fails")
-    flags.add_maxmem(parser)
-    pages.add_flag(parser)
-    flags.add_aovs(parser)
-    flags.add_layers(parser)
-    flags.add_run_flags(parser)
-    parser.set_defaults(run=_sequence)
-
-
-def _sequence(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Returns how many frames failed."""
     frames = parse_frames(options.frames)
     work = shot.Shot(

@@ -6,12 +6,11 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from typing import Any, NoReturn
 
-from tqdm import tqdm
-
 from selfcorrect.errors import FileError, printable
-from selfcorrect.exr.file import OUTPUT
+from selfcorrect.output import OUTPUT
 
 __all__ = ["EndOnInterrupt", "Progress", "answer", "log", "show", "terminable"]
 
@@ -151,7 +150,7 @@ class Progress:
             self._meanwhile()
         if sys.stderr is not None and sys.stderr.isatty():
             if self._bar is None:
-                self._bar = tqdm(total=steps, desc="training", unit="step", file=sys.stderr)
+                self._bar = import_module("tqdm").tqdm(total=steps, desc="training", unit="step", file=sys.stderr)
             self._bar.update(step - self._bar.n)
         elif step * 10 // steps > (step - 1) * 10 // steps:
             log(f"training: step {step} of {steps}")

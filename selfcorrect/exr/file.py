@@ -10,7 +10,6 @@ import io
 import mmap
 import os
 import stat
-import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,9 +20,10 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from selfcorrect.errors import ChannelError, FileError
+from selfcorrect.errors import ChannelError, FileError, one_line
 from selfcorrect.exr import channels, header
 from selfcorrect.exr.header import Attribute, Window
+from selfcorrect.output import OUTPUT
 
 __all__ = [
     "LIBRARY_ERRORS",
@@ -42,9 +42,6 @@ Pixels = NDArray[Any]
 
 LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, MemoryError)
 """What the OpenEXR library raises for a file or an image that it refuses."""
-
-OUTPUT = threading.RLock()
-"""Held while the library's stdout and stderr are silenced: take it to print from another thread, or lose the text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,8 +261,3 @@ def quiet() -> Iterator[None]:
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)
-
-
-def one_line(error: BaseException) -> str:
-    """The message of an error of the library, without its line breaks."""
-    return " ".join(str(error).split()) or type(error).__name__

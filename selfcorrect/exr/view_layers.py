@@ -7,11 +7,9 @@ from selfcorrect.errors import ChannelError
 from selfcorrect.exr import channels
 from selfcorrect.exr.channels import listed
 from selfcorrect.exr.file import headers
+from selfcorrect.settings import ALL_LAYERS
 
-__all__ = ["ALL", "ViewLayers", "chosen", "view_layers"]
-
-ALL = "all"
-"""Every view layer that both halves have."""
+__all__ = ["ViewLayers", "chosen", "view_layers"]
 
 _MADE = "composite"  # what Blender's compositor has made of the others: no render
 
@@ -46,18 +44,19 @@ def chosen(a: str, b: str, wanted: str) -> ViewLayers:
     Args:
         a: half a; where a layer is named, ``file.exr::Layer``, that is it.
         b: half b.
-        wanted: :data:`ALL`, or names with commas between them, case aside; a view stands for all layers of it.
+        wanted: :data:`selfcorrect.settings.ALL_LAYERS`, or names with commas between them, case aside; a view stands
+            for all layers of it.
 
     Raises:
         FileError: a file cannot be read.
         ChannelError: a layer that is named is not in a half.
     """
     if "::" in a or "::" in b:
-        if wanted != ALL:
+        if wanted != ALL_LAYERS:
             raise ChannelError(f"{a}: expected a layer after :: or --layers {wanted}, but got both")
         return ViewLayers((a.partition("::")[2],))
     in_a, in_b = view_layers(a), view_layers(b)
-    if wanted != ALL:
+    if wanted != ALL_LAYERS:
         names = [name for text in wanted.split(",") if text.strip() for name in _named(a, in_a, text.strip())]
         for name in names:
             _named(b, in_b, name)

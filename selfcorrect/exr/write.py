@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-from selfcorrect.errors import FileError, FrameError
+from selfcorrect.errors import FileError, FrameError, one_line
 from selfcorrect.exr import header
-from selfcorrect.exr.file import LIBRARY_ERRORS, ExrFile, Part, Pixels, float_type, one_line, quiet
+from selfcorrect.exr.file import LIBRARY_ERRORS, ExrFile, Part, Pixels, float_type, quiet
 from selfcorrect.publish import publish
 
 __all__ = ["check_source", "check_target", "write"]

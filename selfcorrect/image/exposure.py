@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect.image.bands import average, bands, tile_means
+from selfcorrect.image.channels import channel_mean
 
 __all__ = ["LARGEST", "Radiance", "Scaled", "scale_", "scale_to_one"]
 
@@ -33,14 +34,14 @@ class Scaled:
         self._image, self._factor = image, factor
 
     def __getitem__(self, rows: slice) -> Tensor:
-        return (self._image[rows].double() * self._factor).clamp(max=LARGEST).float()
+        return (self._image[rows].double() * self._factor).clamp_(max=LARGEST).float()
 
 
 def scale_(image: Tensor, factor: float) -> Tensor:
     """Radiance times a factor, in place; bounded by what float32 holds."""
     largest = torch.finfo(torch.float32).max
     for rows in bands(image.shape[0]):
-        image[rows] = (image[rows].double() * factor).clamp(-largest, largest)
+        image[rows] = (image[rows].double() * factor).clamp_(-largest, largest)
     return image
 
 
@@ -49,7 +50,7 @@ def scale_to_one(halves: tuple[Radiance, Radiance]) -> float:
     height, width = halves[0].shape[:2]
 
     def roots(rows: slice) -> Tensor:
-        return torch.stack([half[rows].double().mean(-1).clamp(min=0).sqrt() for half in halves])
+        return torch.stack([channel_mean(half[rows].double()).clamp(min=0).sqrt() for half in halves])
 
     root = sum(average(tile_means(height, roots), (height, width))) / 2
     return 1 / root**2 if root > 0 else 1.0

@@ -5,14 +5,12 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from selfcorrect.errors import MissingKernelsWarning
+
 if TYPE_CHECKING:
     from selfcorrect.kernel import _cpu as functions
 
-__all__ = ["MissingKernelsWarning", "functions", "installed", "missing", "warn_if_missing"]
-
-
-class MissingKernelsWarning(UserWarning):
-    """The compiled kernels are not installed: the reference in plain torch runs instead, which is much slower."""
+__all__ = ["functions", "installed", "missing", "warn_if_missing"]
 
 
 class _Missing:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import chain
 
 import torch
@@ -26,6 +27,19 @@ def mirror(start: int, stop: int, size: int) -> Tensor:
     """
     index = torch.arange(start, stop) % (2 * size)
     return torch.where(index < size, index, 2 * size - 1 - index)
+
+
+def _window(start: int, length: int, size: int, device: torch.device) -> slice | Tensor:
+    """So many pixels of a line: where they are inside it, no copy is needed to have them."""
+    if start >= 0 and start + length <= size:
+        return slice(start, start + length)
+    return mirror(start, start + length, size).to(device)
+
+
+def _cut(image: Tensor, dimension: int, window: slice | Tensor) -> Tensor:
+    if isinstance(window, slice):
+        return image.narrow(dimension, window.start, window.stop - window.start)
+    return image.index_select(dimension, window)
 
 
 @dataclass(frozen=True)
@@ -74,16 +88,20 @@ class Guides:
                 raise FrameError(f"expected a half with the buffer {needed.name}, but got {', '.join(there) or 'none'}")
         color = there[COLOR.name]
         top, left, bottom, right = region or (0, 0, *color.shape[:2])
-        rows = mirror(top - margin, bottom + margin, color.shape[0]).to(color.device)
-        columns = mirror(left - margin, right + margin + _LANES, color.shape[1]).to(color.device)
-
-        def cut(term: Buffer) -> Tensor:
-            part = there[term.name].index_select(0, rows).index_select(1, columns).permute(2, 0, 1)
+        height, width = bottom - top + 2 * margin, right - left + 2 * margin + _LANES
+        rows = _window(top - margin, height, color.shape[0], color.device)
+        columns = _window(left - margin, width, color.shape[1], color.device)
+        inputs = [term for term in INPUTS if term.name in there]
+        dtype = reduce(torch.promote_types, (there[term.name].dtype for term in inputs), torch.float32)
+        planes = torch.empty(sum(t.channels for t in inputs), height, width, dtype=dtype, device=color.device)
+        first = 0
+        for term in inputs:
+            part = _cut(_cut(there[term.name], 0, rows), 1, columns).permute(2, 0, 1)
             if term.kind == "radiance" and scale != 1.0:
-                return (part.double() * scale).clamp(-LARGEST, LARGEST).float()
-            return part.float() if part.dtype == torch.float16 else part
-
-        planes = torch.cat([cut(term) for term in INPUTS if term.name in there]).clamp_(-LARGEST, LARGEST)
+                part = (part.double() * scale).clamp_(-LARGEST, LARGEST).float()
+            planes[first : first + term.channels] = part
+            first += term.channels
+        planes.clamp_(-LARGEST, LARGEST)
         terms = tuple(term for term in TERMS if term.name in there)
         return cls(planes, bottom - top, right - left, margin, terms)
 

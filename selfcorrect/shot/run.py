@@ -14,11 +14,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from selfcorrect import exr, files
-from selfcorrect.errors import FileError, SelfcorrectError, out_of_memory
-from selfcorrect.exr.file import one_line
-from selfcorrect.exr.view_layers import ALL
+from selfcorrect.errors import FileError, SelfcorrectError, one_line, out_of_memory
 from selfcorrect.publish import remove_abandoned
-from selfcorrect.settings import Settings
+from selfcorrect.settings import ALL_LAYERS, Settings
 from selfcorrect.shot.chain import Chain, Link
 from selfcorrect.shot.framerange import fill, has_frame
 from selfcorrect.shot.recipe import Digests, recipe, unlike
@@ -54,7 +52,7 @@ class Shot:
     denoised_full: str | None = None
     mapping: Mapping[str, str] | None = None
     aovs: str | None = None
-    layers: str = ALL
+    layers: str = ALL_LAYERS
 
     def sources(self, frame: int) -> files.Sources:
         """The files of one frame.

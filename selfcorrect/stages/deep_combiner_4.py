@@ -14,7 +14,7 @@ from selfcorrect.buffers import COLOR, FEATURES
 from selfcorrect.errors import FrameError
 from selfcorrect.frame import DualDenoiser, Frame, checked, mean, prefiltered
 from selfcorrect.image.repair import Repairs
-from selfcorrect.settings import Settings
+from selfcorrect.settings import EXTRA_FLAGS, Settings
 from selfcorrect.stages.deep_combiner import DeepCombinerStage, opened_network
 from selfcorrect.stages.images import StageImages
 from selfcorrect.stages.stage import Extra, Work
@@ -95,12 +95,7 @@ class DeepCombiner4(DeepCombinerStage):
 
     name = "deep-combiner-4"
     first_only = True
-    extra = Extra(
-        flag="--sub-images",
-        files=("A1.exr", "A2.exr", "B1.exr", "B2.exr"),
-        help="the two renders whose mean is half a, and those of half b, for the stage deep-combiner-4",
-        of=SubImages.of,
-    )
+    extra = Extra(*EXTRA_FLAGS["deep-combiner-4"], of=SubImages.of)
 
     def __init__(self, settings: Settings):
         super().__init__(settings)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.frame import mean
+from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import scale_
 from selfcorrect.image.windows import box_mean, gaussian_mean
 from selfcorrect.stages.images import StageImages
@@ -38,7 +39,7 @@ def variance_of_mean(halves: tuple[Tensor, Tensor]) -> Tensor:
 
 def relative_weight(unbiased: Tensor, *, sigma: float = _LEVEL_SIGMA) -> Tensor:
     """1 / (level² + ε), (H, W, 1) float64, with the level the mean over channels and a Gaussian window of (H, W, C)."""
-    level = gaussian_mean(unbiased.double().mean(-1)[None], sigma)[0]
+    level = gaussian_mean(channel_mean(unbiased.double())[None], sigma)[0]
     floor = max(_DARKEST * float(level.abs().mean()), torch.finfo(torch.float32).tiny)
     return (1 / (level**2 + floor**2))[..., None]
 

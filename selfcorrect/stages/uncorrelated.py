@@ -14,12 +14,13 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.image.windows import box_mean, reflected
+from selfcorrect.settings import COMBINE_KERNELS
 
 __all__ = ["GAMMAS", "KERNELS", "WINDOW", "combine"]
 
 WINDOW = 15
 GAMMAS = (0.01, 0.025, 0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 2.5)
-KERNELS = ("uncorrelated", "cross-weighting", "uniform")
+KERNELS = COMBINE_KERNELS
 _ROWS = 64  # worked on at a time, so that the sums stay in the cache
 
 

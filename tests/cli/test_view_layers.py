@@ -9,7 +9,8 @@ from helpers.commands import BALANCED, call, refused
 from helpers.exr_files import save, three
 
 from selfcorrect import exr
-from selfcorrect.exr.view_layers import ALL, chosen, view_layers
+from selfcorrect.exr.view_layers import chosen, view_layers
+from selfcorrect.settings import ALL_LAYERS
 
 SIZE = (24, 30)
 FEW = [*BALANCED, "--candidates", "none"]
@@ -51,10 +52,10 @@ def mean(paths: list[Path], name: str) -> np.ndarray:
 def test_layers_are_those_with_a_colour(halves: list[Path]) -> None:
     assert view_layers(str(halves[0])) == [*LAYERS, "Composite"]
     a, b = map(str, halves)
-    assert chosen(a, b, ALL) == (LAYERS, ())
+    assert chosen(a, b, ALL_LAYERS) == (LAYERS, ())
     assert chosen(a, b, "far").names == ("Far",)
     assert chosen(a, b, "Composite,Near").names == ("Composite", "Near")
-    assert chosen(f"{a}::Far", b, ALL).names == ("Far",)
+    assert chosen(f"{a}::Far", b, ALL_LAYERS).names == ("Far",)
 
 
 def test_each_layer_is_what_it_is_alone(halves: list[Path], tmp_path: Path) -> None:

@@ -3,50 +3,18 @@
 // namespace and uses no standard template, so that no wide instruction can leak into a baseline build.
 // GRADIENTS.md derives what stands here; reference.py is the readable form.
 
-#include "job.h"
-#include "simd.h"
+#if defined(__AVX512F__) || defined(__aarch64__)
+#include "sweeps_at_once.h"
+#else
+#include "sweeps_by_term.h"
+#endif
 
 namespace {
 
-using selfcorrect::Job;
 using selfcorrect::Mode;
 
 constexpr float epsilon = 1e-4f;           // Eq. 11
 constexpr float centre_epsilon = 1e-4f;    // added to tau
-constexpr float log2_e = 1.44269504f;
-
-// A pixel's values of a guide.
-template <int Channels>
-struct Vector {
-    Float v[Channels];
-};
-
-using Three = Vector<3>;
-
-template <int Channels>
-inline Vector<Channels> load_planes(const float* p, std::int64_t plane_stride) {
-    Vector<Channels> x;
-    for (int k = 0; k < Channels; ++k) x.v[k] = load(p + k * plane_stride);
-    return x;
-}
-
-template <int Channels>
-inline Vector<Channels> operator-(const Vector<Channels>& a, const Vector<Channels>& b) {
-    Vector<Channels> d;
-    for (int k = 0; k < Channels; ++k) d.v[k] = a.v[k] - b.v[k];
-    return d;
-}
-
-template <int Channels>
-inline Float dot(const Vector<Channels>& a, const Vector<Channels>& b, Float sum) {
-    for (int k = 0; k < Channels; ++k) sum += a.v[k] * b.v[k];
-    return sum;
-}
-
-// sum += w d
-inline void accumulate(Three& sum, Float w, const Three& d) {
-    for (int k = 0; k < 3; ++k) sum.v[k] += w * d.v[k];
-}
 
 // Lanes beyond `n` are filled with zero, so that they stay finite.
 inline Float load_strided(const float* p, std::int64_t stride, int n) {
@@ -71,13 +39,8 @@ class Block {
 public:
     // Pixels x .. x + n - 1 (n <= lanes) of row `row` of patch `patch`.
     Block(const Job& job, int patch, int row, int x, int n, float* scratch)
-        : job(job), stride(job.plane_stride), patch(patch), row(row), x(x), n(n), scratch(scratch) {
-        offset = (job.corners[2 * patch] + row) * job.row_stride + job.corners[2 * patch + 1] + x;
-        for_each_term<Present>([&](auto m) {
-            const auto c = guide<m.value>(job.planes + offset);
-            for (int k = 0; k < terms[m.value].channels; ++k) centre[m.value].v[k] = c.v[k];
-        });
-    }
+        : job(job), patch(patch), row(row), x(x), n(n), scratch(scratch),
+          taps(job, (job.corners[2 * patch] + row) * job.row_stride + job.corners[2 * patch + 1] + x) {}
 
     void activate() {
         const int betas = job.eq3 ? 0 : at.betas;
@@ -114,43 +77,7 @@ public:
         // All sums are of differences to the centre: exact where the window is constant.
         Float w_sum = {};
         Three sum[term_count] = {};
-        float* kept = scratch;
-        for (int dy = -radius; dy <= radius; ++dy) {
-            const int first = first_tap(dy, radius);
-            const float* p = job.planes + offset + dy * job.row_stride + first;
-            for (int dx = first; dx <= radius; dx += every, p += every) {
-                Three d[term_count];
-                Float distance[term_count], exponent;
-                for_each_term<Present>([&](auto m) {
-                    const auto difference = centre_of<m.value>() - guide<m.value>(p);
-                    if constexpr (raised(m.value)) d[m.value] = difference;
-                    if constexpr (terms[m.value].logarithmic)
-                        distance[m.value] = log2_above_one(dot(difference, difference, splat(1.0f)));
-                    else
-                        distance[m.value] = dot(difference, difference, Float{});
-                    if constexpr (m.value == 0)
-                        exponent = distance[0] * factor[0];
-                    else
-                        exponent += distance[m.value] * factor[m.value];
-                });
-                Float w = exp2_nonpositive(exponent);
-                if (dx == 0 && dy == 0) w = centre_weight;
-                w_sum += w;
-                for_each_term<Present>([&](auto m) {
-                    if constexpr (raised(m.value)) accumulate(sum[m.value], w, d[m.value]);
-                });
-                if constexpr (Keep) {
-                    store(kept, w);
-                    kept += lanes;
-                    for_each_term<Present>([&](auto m) {
-                        if constexpr (terms[m.value].logarithmic) {
-                            store(kept, distance[m.value]);
-                            kept += lanes;
-                        }
-                    });
-                }
-            }
-        }
+        gather_taps<Keep>(taps, factor, centre_weight, scratch, w_sum, sum);
         w_inverse = 1.0f / w_sum;
         for (int k = 0; k < 3; ++k) {
             for_each_term<Present>([&](auto m) {
@@ -158,7 +85,7 @@ public:
             });
             change.v[k] = -sum[noisy].v[k] * w_inverse;
             for (int b = k; b < at.betas; b += 3) change.v[k] += beta[b] * deviation[b];
-            g.v[k] = centre[noisy].v[k] + change.v[k];
+            g.v[k] = taps.centre[noisy].v[k] + change.v[k];
         }
     }
 
@@ -176,8 +103,8 @@ public:
 
     // Eq. 8 without its mean: adds 1/2 weight |g - target|^2 to `sum`, returns the gradient in g.
     Three loss(double& sum) const {
-        const Float weight = load(job.weight + offset);
-        const Three target = load_planes<3>(job.target + offset, stride);
+        const Float weight = load(job.weight + taps.offset);
+        const Three target = load_planes<3>(job.target + taps.offset, taps.stride);
         Three gradient;
         Float loss = {};
         for (int k = 0; k < 3; ++k) {
@@ -191,7 +118,6 @@ public:
 
     // Gradients of all raw heads from dL/dg and what gather<true>() kept.
     void scatter(const Three& gradient) {
-        // s_i = sum_k G_k (h_ik - g_k) = G.(y_i - y_c) + (G beta).(z_c - z_i) + ... - s_centre
         const Float s_centre = dot(gradient, change, Float{});
         Three by[term_count];
         for_each_term<Present>([&](auto m) {
@@ -199,33 +125,7 @@ public:
                 for (int k = 0; k < 3; ++k) by[m.value].v[k] = gradient.v[k] * beta[at.beta[m.value] + k];
         });
         Float sum[term_count] = {};
-        const int radius = job.window / 2, every = job.every;
-        const float* kept = scratch;
-        for (int dy = -radius; dy <= radius; ++dy) {
-            const int first = first_tap(dy, radius);
-            const float* p = job.planes + offset + dy * job.row_stride + first;
-            for (int dx = first; dx <= radius; dx += every, p += every, kept += at.kept * lanes) {
-                Float s = dot(gradient, guide<noisy>(p) - centre_of<noisy>(), -s_centre);
-                Float squared[term_count];
-                for_each_term<Present>([&](auto m) {
-                    if constexpr (m.value != noisy) {
-                        const auto d = centre_of<m.value>() - guide<m.value>(p);
-                        if constexpr (terms[m.value].scale) s = dot(by[m.value], d, s);
-                        if constexpr (!terms[m.value].logarithmic) squared[m.value] = dot(d, d, Float{});
-                    }
-                });
-                const Float t = load(kept) * s;
-                const float* keep = kept + lanes;
-                for_each_term<Present>([&](auto m) {
-                    if constexpr (terms[m.value].logarithmic) {
-                        sum[m.value] += t * load(keep);
-                        keep += lanes;
-                    } else {
-                        sum[m.value] += t * squared[m.value];
-                    }
-                });
-            }
-        }
+        scatter_taps(taps, gradient, by, s_centre, scratch, sum);
         const int betas = job.eq3 ? 0 : at.betas;
         for (int k = 0; k < betas; ++k)
             store_head(k, gradient.v[k % 3] * deviation[k] * (1.0f - beta[k] * beta[k]));
@@ -239,27 +139,6 @@ public:
     }
 
 private:
-    // Whether the output has the term's differences, not the weights alone.
-    static constexpr bool raised(int m) { return m == noisy || terms[m].scale; }
-
-    template <int M>
-    Vector<terms[M].channels> guide(const float* pixel) const {
-        return load_planes<terms[M].channels>(pixel + at.plane[M] * stride, stride);
-    }
-
-    template <int M>
-    Vector<terms[M].channels> centre_of() const {
-        Vector<terms[M].channels> c;
-        for (int k = 0; k < terms[M].channels; ++k) c.v[k] = centre[M].v[k];
-        return c;
-    }
-
-    // Taps with dx = slope dy (mod every) are taken: a lattice that has the centre and is spread over all rows.
-    int first_tap(int dy, int radius) const {
-        const int slope = job.every < 4 ? 1 : 2;
-        return -radius + (slope * dy + radius + job.every * job.window) % job.every;
-    }
-
     Float head(int k) const {
         const auto& s = job.head_strides;
         return load_strided(job.heads + patch * s[0] + k * s[1] + row * s[2] + x * s[3], s[3], n);
@@ -271,12 +150,11 @@ private:
     }
 
     const Job& job;
-    const std::int64_t stride;
     const std::int64_t patch, row, x;
     const int n;
     float* const scratch;
-    std::int64_t offset;
-    Three centre[term_count], g, change;
+    const Taps<Present> taps;
+    Three g, change;
     Float w_inverse, centre_weight, centre_slope;
     Float beta[at.betas], deviation[at.betas], inverse[at.gammas], inverse_slope[at.gammas];
 };

@@ -38,6 +38,7 @@ struct Layout {
     int plane[term_count];  // first one
     int beta[term_count];   // first head; those of Eq. 10 only
     int gamma[term_count];  // among the bandwidths
+    int logarithm[term_count];  // among the logarithmic distances
     int betas, gammas;
     int kept;  // floats kept of each tap: its weight and the logarithmic distances
 };
@@ -52,6 +53,7 @@ constexpr Layout layout(unsigned present) {
         at.beta[m] = at.betas;
         at.betas += terms[m].scale ? 3 : 0;
         at.gamma[m] = at.gammas++;
+        at.logarithm[m] = at.kept - 1;
         at.kept += terms[m].logarithmic;
     }
     return at;

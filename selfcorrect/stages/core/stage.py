@@ -70,10 +70,12 @@ def inferred(state: StageImages, network: Network, settings: Settings, keep: Kee
     gained = gained_by_both(images, full) if settings.inference == "full" else None
     for rows in bands(size[0], SIDE):
         a, b = (infer(network, half, settings, scale=state.scale, rows=rows) for half in state.halves)
-        image[rows] = mean((a, b))
-        if gained is not None:
-            share = enlarged_rows(gained, size, rows)[0, :, :, None]
-            image[rows] += share.to(image.dtype) * (full[rows] - mean((images[0][rows], images[1][rows])))
+        for part in bands(rows.stop - rows.start):
+            own = slice(rows.start + part.start, rows.start + part.stop)
+            image[own] = mean((a[part], b[part]))
+            if gained is not None:
+                share = enlarged_rows(gained, size, own)[0, :, :, None]
+                image[own] += share.to(image.dtype) * (full[own] - mean((images[0][own], images[1][own])))
         keep(rows, (a, b))
     return scale_(image.clamp_(min=0), 1 / state.scale)
 

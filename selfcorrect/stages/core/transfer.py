@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect.image.bands import tile_means
+from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Radiance
 
 __all__ = ["gained_by_both"]
@@ -31,9 +32,9 @@ def gained_by_both(denoised: tuple[Radiance, Radiance], denoised_full: Radiance)
 
     def squares(rows: slice) -> Tensor:
         a, b, full = (image[rows].double() for image in (*denoised, denoised_full))
-        weight = 1 / (full.mean(-1) ** 2 + _DARKEST)
+        weight = 1 / (channel_mean(full) ** 2 + _DARKEST)
         changed, variance = (full - (a + b) / 2) ** 2, (a - b) ** 2 / 4
-        return torch.stack([weight * changed.mean(-1), weight * variance.mean(-1)])
+        return torch.stack([weight * channel_mean(changed), weight * channel_mean(variance)])
 
     changed, variance = tile_means(denoised_full.shape[0], squares)
     share: Tensor = changed / variance.clamp(min=torch.finfo(torch.float64).tiny)
