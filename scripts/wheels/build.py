@@ -36,6 +36,14 @@ TARGETS = {
     "windows-x86_64": Target("x86_64-windows-gnu", "Windows", "AMD64", "win_amd64"),
     "macos-arm64": Target("aarch64-macos.11.0", "Darwin", "arm64", "macosx_11_0_arm64"),
 }
+# nanobind hands Apple's linker a file of the names that Python brings at run time; Zig's own takes no such file.
+OWN_LINKER = """
+for argument do
+    shift
+    case "$argument" in -Wl,@*) argument=-Wl,-undefined,dynamic_lookup ;; esac
+    set -- "$@" "$argument"
+done
+"""
 STABLE = sys.version_info >= (3, 12)
 
 
@@ -104,7 +112,7 @@ def toolchain_of(target: Target, folder: Path) -> str:
     for name in ("c++", "ar", "ranlib"):
         flags = f" -target {target.triple}" if name == "c++" else ""
         program = folder / f"zig-{name.replace('+', 'x')}"
-        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {name}{flags} "$@"\n')
+        program.write_text(f'#!/bin/sh\n{OWN_LINKER}exec "{sys.executable}" -m ziglang {name}{flags} "$@"\n')
         program.chmod(0o755)
     return f"""
 set(CMAKE_SYSTEM_NAME {target.system})

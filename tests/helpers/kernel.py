@@ -33,6 +33,8 @@ TOLERANCE = {
         "convolution": 3e-6,  # 7.7e-7
         "convolution gradients": 1e-5,  # 1.4e-6
         "nlm": 5e-6,  # 7.9e-7
+        "regression models": 1e-3,  # 5.0e-4: slopes that the ridge alone determines, at 1e-4 of the largest
+        "regression what models say": 2e-6,  # 1.0e-6: the same models' values in their windows
         "regression": 1e-4,  # 4.7e-5: a line of 17 pixels, models at every third
     },
     # The same by norm, to float64 with the same roundings.

@@ -1,5 +1,7 @@
 """The windowed regression: the reference by hand, and the compiled variants against it at awkward sizes."""
 
+import math
+
 import pytest
 import torch
 from helpers.kernel import TOLERANCE as TABLE
@@ -8,6 +10,7 @@ from torch import Tensor
 
 from selfcorrect.errors import FrameError, SettingsError
 from selfcorrect.kernel.backend import instruction_sets
+from selfcorrect.kernel.compiled import functions
 from selfcorrect.kernel.regression import cpu, regress
 from selfcorrect.kernel.regression import reference as regression_reference
 
@@ -147,3 +150,28 @@ def test_every_backend_gives_the_same() -> None:
     got = regress(features, targets, **OPTIONS, stride=2)
     assert torch.equal(got, regress(features, targets, **OPTIONS, stride=2, backend="cpu"))
     assert float((got.double() - expected).abs().max() / expected.abs().max()) < TOLERANCE
+
+
+@pytest.mark.parametrize("isa", VARIANTS)
+@pytest.mark.parametrize("stride", [1, 2])
+def test_models_of_features_that_are_nearly_one(isa: str, stride: int) -> None:
+    """A grey image: only the ridge tells its three slopes apart, and rounding could lead them anywhere."""
+    size, ridge, bandwidth = (9, 20), 1e-4, 10.0
+    features = [torch.linspace(0.1, 1, 180).view(9, 20, 1) + 1e-3 * image(size, 3, 0)]
+    targets = image(size, 3, 1)
+    rows, columns = range(0, 9, stride), range(0, 20, stride)
+    around = regression_reference._Windows(features[0], targets, 6, columns)
+    difference, values = around.of(rows)
+    weight = regression_reference._weight(difference, 3, bandwidth)
+    expected = regression_reference._models(difference, values, weight, [3], ridge)
+    layout = cpu.Layout.of(features, targets, 6, stride)
+    got = torch.empty(12, layout.height, layout.width)
+    functions.solve(*layout.arguments, ridge, 1 / (bandwidth * math.log(2)), None, 0, layout.height, isa, 1, got)
+    models = got.double().unflatten(0, (3, 4)).permute(2, 3, 1, 0)
+
+    def said(models: Tensor) -> Tensor:
+        return models[..., :1, :] + torch.einsum("yxti,yxik->yxtk", difference, models[..., 1:, :])
+
+    for name, one, other in (("models", models, expected), ("what models say", said(models), said(expected))):
+        worst = float((one - other).abs().max() / other.abs().max())
+        assert worst < TABLE[torch.float32][f"regression {name}"], f"{name} off by {worst:.1e} of the maximum"

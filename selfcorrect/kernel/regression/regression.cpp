@@ -19,6 +19,9 @@ inline int ceil_div(int a, int b) { return a >= 0 ? (a + b - 1) / b : -(-a / b);
 inline int floor_div(int a, int b) { return -ceil_div(-a, b); }
 constexpr int smaller(int a, int b) { return a < b ? a : b; }
 
+typedef double Double __attribute__((vector_size(8 * lanes)));
+inline Double widened(Float x) { return __builtin_convertvector(x, Double); }
+
 inline Float square_root(Float x) {
     float lane[lanes];
     store(lane, x);
@@ -54,40 +57,45 @@ public:
         }
     }
 
+    // In double precision: where features are nearly one another's combinations, the ridge alone bounds a pivot from
+    // below, and rounding to float would be 1 / ridge times as large in the slopes.
     void solve() {
         // Scaled to a mean over the window and to features of at most 1, so that the ridge means the same everywhere.
-        const Float share = 1.0f / maximum(moment(0, 0), splat(1e-30f));
-        Float scale[unknowns];
-        scale[0] = splat(1.0f);
+        const Double share = 1.0 / widened(maximum(moment(0, 0), splat(1e-30f)));
+        Double scale[unknowns];
+        scale[0] = 1.0 - Double{};
         for (int k = 0; k < features; ++k) {
             const Float r = reach[k < 3 * Vectors ? k / 3 : k - 2 * Vectors];
-            scale[k + 1] = r > smallest_reach ? 1.0f / square_root(maximum(r, splat(smallest_reach))) : Float{};
+            const Float inverse = 1.0f / square_root(maximum(r, splat(smallest_reach)));
+            scale[k + 1] = widened(r > smallest_reach ? inverse : Float{});
         }
-        Float lower[unknowns][unknowns], pivot[unknowns], inverse[unknowns];
+        const Double ridge = double(job.ridge) - Double{};
+        Double lower[unknowns][unknowns], pivot[unknowns], inverse[unknowns];
         for (int j = 0; j < unknowns; ++j) {  // L D L^T
             for (int i = j; i < unknowns; ++i) {
-                Float a = moment(j, i) * share * scale[i] * scale[j];
-                if (i == j && j > 0) a += job.ridge;
+                Double a = widened(moment(j, i)) * share * scale[i] * scale[j];
+                if (i == j && j > 0) a += ridge;
                 for (int k = 0; k < j; ++k) a -= lower[i][k] * lower[j][k] * pivot[k];
                 if (i == j) {
-                    pivot[j] = maximum(a, splat(job.ridge));  // it is no less but for rounding
-                    inverse[j] = 1.0f / pivot[j];
+                    pivot[j] = a > ridge ? a : ridge;  // it is no less but for rounding of the moments
+                    inverse[j] = 1.0 / pivot[j];
                 } else {
                     lower[i][j] = a * inverse[j];
                 }
             }
         }
         for (int channel = 0; channel < 3; ++channel) {
-            Float b[unknowns];
+            Double b[unknowns];
             for (int i = 0; i < unknowns; ++i) {
-                b[i] = moment(i, unknowns + channel) * share * scale[i];
+                b[i] = widened(moment(i, unknowns + channel)) * share * scale[i];
                 for (int k = 0; k < i; ++k) b[i] -= lower[i][k] * b[k];
             }
             for (int i = 0; i < unknowns; ++i) b[i] *= inverse[i];
             for (int i = unknowns - 1; i >= 0; --i) {
                 for (int k = i + 1; k < unknowns; ++k) b[i] -= lower[k][i] * b[k];
             }
-            for (int i = 0; i < unknowns; ++i) write(channel * unknowns + i, b[i] * scale[i]);
+            for (int i = 0; i < unknowns; ++i)
+                write(channel * unknowns + i, __builtin_convertvector(b[i] * scale[i], Float));
         }
     }
 
@@ -139,9 +147,7 @@ private:
     template <int Row, int Column>
     void blocks(int count) {
         constexpr int rows = smaller(block_rows, unknowns - Row), wide = smaller(block_columns, columns - Column);
-        Float sum[rows][wide];
-        for (int r = 0; r < rows; ++r)
-            for (int c = 0; c < wide; ++c) sum[r][c] = moment(Row + r, Column + c);
+        Float sum[rows][wide] = {};  // of this chunk alone: summing in two levels loses less to rounding
         for (int i = 0; i < count; ++i) {
             const float* u = values + (i * columns + Column) * lanes;
             const float* wu = products + (i * unknowns + Row) * lanes;
@@ -153,7 +159,8 @@ private:
             }
         }
         for (int r = 0; r < rows; ++r)
-            for (int c = 0; c < wide; ++c) store(moments + ((Row + r) * columns + Column + c) * lanes, sum[r][c]);
+            for (int c = 0; c < wide; ++c)
+                store(moments + ((Row + r) * columns + Column + c) * lanes, moment(Row + r, Column + c) + sum[r][c]);
         if constexpr (Column + wide < columns)
             blocks<Row, Column + wide>(count);
         else if constexpr (Row + rows < unknowns)
