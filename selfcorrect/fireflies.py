@@ -15,8 +15,8 @@ whose mean is near 1, and ε = 0.1:
    min(m^a, m^b). What is as bright as the frame's lights and their reflections may be one.
 4. The darker half is itself no brighter than that: a lamp or a star that both have met stays, however different.
 5. Nowhere within four pixels is there a pixel of the spot around which the other half's noisy pixels, again within
-   four, reach half of the brightest of the spot's own half. In a caustic both meet paths of the same great energy, one
-   here and one beside: however few, they are light.
+   four, reach half of the brightest of the spot's own half; nor do those of neighbouring frames, along their motion. In
+   a caustic all meet paths of the same great energy, one here and one beside: however few, they are light.
 
 What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
 given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
@@ -96,7 +96,14 @@ class Removed(NamedTuple):
 
 
 def remove_fireflies_(
-    image: Tensor, color: Pair, denoised: Pair, denoised_full: Radiance, *, scale: float = 1.0, rule: Rule | None = None
+    image: Tensor,
+    color: Pair,
+    denoised: Pair,
+    denoised_full: Radiance,
+    *,
+    seen: Tensor | None = None,
+    scale: float = 1.0,
+    rule: Rule | None = None,
 ) -> Removed:
     """Remove fireflies from an image that was made of both halves, in place.
 
@@ -105,11 +112,12 @@ def remove_fireflies_(
         color: the noisy halves, like the others of the same shape and units.
         denoised: the denoised halves, each made of one half alone.
         denoised_full: denoised mean of the halves, whose error is told.
+        seen: of neighbouring frames, as :class:`selfcorrect.Frame` has it.
         scale: what brings radiance to a mean near 1.
         rule: by default the one that the module describes.
     """
     rule = rule or Rule()
-    found = _Search(color, denoised, scale, rule)
+    found = _Search(color, denoised, seen, scale, rule)
     before = _mean(image, lambda rows: image[rows].double().mean(-1))
     for _ in range(_TRIES):
         taken = _mean(image, lambda rows: found.excess(image, rows).mean(-1))
@@ -144,9 +152,9 @@ class _Search:
         stricter: what the threshold is multiplied by.
     """
 
-    def __init__(self, color: Pair, denoised: Pair, scale: float, rule: Rule):
+    def __init__(self, color: Pair, denoised: Pair, seen: Tensor | None, scale: float, rule: Rule):
         self.stricter = 1.0
-        self._color, self._denoised, self._scale, self._rule = color, denoised, scale, rule
+        self._color, self._denoised, self._seen, self._scale, self._rule = color, denoised, seen, scale, rule
         self._size = (denoised[0].shape[0], denoised[0].shape[1])
         self._spread = _median_around(_tile_quantiles(self._size, self._disagreement, rule.quantile))[None]
         self._usual = self._usual_brightness()
@@ -190,9 +198,12 @@ class _Search:
         return contradicted
 
     def _met_by_both(self, a: Tensor, b: Tensor, rows: slice) -> Tensor:
-        """Whether the darker half's noisy pixels nearby are about as bright as the brighter one's, (rows, W)."""
+        """Whether noisy pixels nearby, not the brighter half's own, are about as bright as its, (rows, W)."""
         in_a, in_b = (_largest_around(noisy, _SPOT) for noisy in self._means(self._color, rows))
-        return torch.where(a > b, in_b > self._rule.alike * in_a, in_a > self._rule.alike * in_b)
+        brighter, others = torch.where(a > b, in_a, in_b), torch.where(a > b, in_b, in_a)
+        if self._seen is not None:
+            others = torch.maximum(others, _largest_around(self._seen[rows] * self._scale, _SPOT))
+        return others > self._rule.alike * brighter
 
     def excess(self, image: Radiance, rows: slice) -> Tensor:
         """What to take off rows of an image, (rows, W, 3) ≥ 0."""

@@ -110,6 +110,22 @@ def test_light_that_the_other_half_has_met_beside_it_stays(energy: float, goes: 
     assert not goes or error(image, clean) < 0.1 * error(before, clean)
 
 
+@pytest.mark.parametrize(("energy", "goes"), [(70.0, False), (20.0, True)])
+def test_light_that_a_neighbouring_frame_has_met_stays(energy: float, goes: bool) -> None:
+    """One path in ten halves is chance; two are a caustic."""
+    clean, pair = truth(), halves(truth())
+    noisy = [half.clone() for half in pair]
+    pair[0] = pair[0] + spot(SIZE, 40, 50)
+    noisy[0][40, 50] += 80.0
+    seen = truth().mean(-1)
+    seen[43, 46] += energy
+    before = (pair[0] + pair[1]) / 2
+    image, found = removed(pair, noisy, seen=seen)
+    assert (found.pixels > 0) == goes
+    assert goes or torch.equal(image, before)
+    assert not goes or error(image, clean) < 0.1 * error(before, clean)
+
+
 def test_a_caustic_explains_itself() -> None:
     """A region of 60 pixels where the halves disagree, and the noisy ones more, in a frame where they agree."""
     strength = torch.zeros(*SIZE, 1)

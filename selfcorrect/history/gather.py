@@ -14,7 +14,7 @@ from selfcorrect.frame import Frame
 from selfcorrect.history.motion import Motion, features, fetched, warped
 from selfcorrect.image.exposure import scale_to_one
 
-__all__ = ["averaged", "gathered"]
+__all__ = ["averaged", "brightest", "gathered"]
 
 # What a fetched pixel may differ in: the best of a few on two frames of one shot; `scripts/bench/shot.py` measures what
 # comes of them.
@@ -71,6 +71,19 @@ def averaged(
         total += weight
         found[number] = float(weight.mean())
     return (sum_ / total).clamp(min=0), found
+
+
+def brightest(neighbours: Mapping[int, tuple[Frame, Motion]]) -> Tensor:
+    """The largest mean of the channels that any noisy half of them has where it shows a pixel's surface, (H, W).
+
+    Of paths of great energy: whether others have met them, too. 0 where no motion is believed.
+    """
+    most = torch.zeros(())
+    for other, motion in neighbours.values():
+        for half in other.color:
+            shown = fetched(half.mean(-1, keepdim=True), motion.offset)[..., 0]
+            most = torch.maximum(shown * motion.known, most.to(shown.device))
+    return most
 
 
 def _weight(
