@@ -15,8 +15,10 @@ whose mean is near 1, and ε = 0.1:
    min(m^a, m^b). What is as bright as the frame's lights and their reflections may be one.
 4. The darker half is itself no brighter than that: a lamp or a star that both have met stays, however different.
 5. Nowhere within four pixels is there a pixel of the spot around which the other half's noisy pixels, again within
-   four, reach half of the brightest of the spot's own half; nor do those of neighbouring frames, along their motion. In
-   a caustic all meet paths of the same great energy, one here and one beside: however few, they are light.
+   four, reach half of the brightest of the spot's own half. In a caustic both meet paths of the same great energy, one
+   here and one beside: however few, they are light. Nor have neighbouring frames met it, along their motion: of the
+   energy E that the spot's own half has there, all other halves have less than a quarter on average, each counted
+   for E at most. The image of both halves shows E / 2 where p E is true: below p = 1/4 nothing is nearer.
 
 What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
 given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
@@ -59,6 +61,7 @@ class Rule(NamedTuple):
         darkest: ε.
         doubts: standard errors of the other half's noisy pixels.
         alike: share of a firefly's noisy radiance that the other half's pixels nearby must not reach.
+        often: how often, on average over all other halves, such paths must not be met.
         usual: share of the pixels, 0 … 1, that are darker than what may be a light.
         most: share of the image's light, 0 … 1, that may go.
     """
@@ -69,6 +72,7 @@ class Rule(NamedTuple):
     darkest: float = 0.1
     doubts: float = 2.0
     alike: float = 0.5
+    often: float = 0.25
     usual: float = 0.99
     most: float = 0.01
 
@@ -199,11 +203,17 @@ class _Search:
 
     def _met_by_both(self, a: Tensor, b: Tensor, rows: slice) -> Tensor:
         """Whether noisy pixels nearby, not the brighter half's own, are about as bright as its, (rows, W)."""
-        in_a, in_b = (_largest_around(noisy, _SPOT) for noisy in self._means(self._color, rows))
-        brighter, others = torch.where(a > b, in_a, in_b), torch.where(a > b, in_b, in_a)
-        if self._seen is not None:
-            others = torch.maximum(others, _largest_around(self._seen[rows] * self._scale, _SPOT))
-        return others > self._rule.alike * brighter
+        pair = self._means(self._color, rows)
+        bright, other = torch.where(a > b, pair[0], pair[1]), torch.where(a > b, pair[1], pair[0])
+        met = _largest_around(other, _SPOT) > self._rule.alike * _largest_around(bright, _SPOT)
+        if self._seen is None:
+            return met
+        usual = torch.minimum(a, b)
+        energy, theirs = (_mean_around(noisy - usual, _SPOT) for noisy in (bright, other))
+        seen = (self._seen[rows].double() * self._scale).unbind(-1)
+        halves = [theirs, *(_mean_around(excess, _SPOT) for excess in seen)]
+        capped = torch.stack([torch.minimum(one, energy) for one in halves])
+        return met | (capped.mean(0) > self._rule.often * energy)
 
     def excess(self, image: Radiance, rows: slice) -> Tensor:
         """What to take off rows of an image, (rows, W, 3) ≥ 0."""

@@ -85,8 +85,8 @@ class Frame:
     Attributes:
         aids: what the denoiser was given beside the colours of both halves together, of half a and of half b, where
             :meth:`denoise` was asked to keep it.
-        seen: (H, W), the largest mean of the channels that a noisy half of a neighbouring frame has where it shows a
-            pixel's surface, 0 where none is known; None without neighbours.
+        seen: (H, W, halves), how far the noisy halves of neighbouring frames lie above what is usual where they show a
+            pixel's surface, by the mean of the channels; None without neighbours.
 
     Raises:
         FrameError: sizes or channel counts do not fit, or a channel of radiance is NaN or infinite at more than half
@@ -229,7 +229,7 @@ class Frame:
         return frame
 
     def with_seen(self, seen: Tensor) -> "Frame":
-        """This frame with the brightest that neighbouring frames show of it."""
+        """This frame with what neighbouring frames have met of it."""
         frame = self._copy()
         object.__setattr__(frame, "seen", seen)
         return frame

@@ -52,7 +52,7 @@ _COMPARED = 250  # bytes of a pixel that the metrics take beside the images
 _RGB = 12  # bytes of a pixel of three float32 channels
 _CANDIDATES = 2  # OIDN's other modes
 _MOTIONS = 36  # bytes of a pixel: offsets and whether they are known, to the frames within two and back
-_SEEN = 4  # bytes of a pixel: the brightest of the frames around
+_SEEN = 8  # bytes of a pixel for each frame around: what its halves have met there
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
@@ -196,7 +196,8 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = 
         around = half + held + max(stored, half) + 2 * image + 2 * held
         if history:
             kept = 2 * half + 6 * image + 3 * aids + _MOTIONS * pixels  # also what was gathered and denoised again
-            around += (2 * settings.frame_radius + 2) * kept + 3 * image + _SEEN * pixels
+            around += (2 * settings.frame_radius + 2) * kept + 3 * image
+            around += 2 * settings.frame_radius * _SEEN * pixels
         around *= layers
     around += (layers - 1) * (image + (held if _corrects(sources) else 0))
     both, base = 2 * half, BASE + around

@@ -14,7 +14,7 @@ from selfcorrect.frame import Frame
 from selfcorrect.history.motion import Motion, features, fetched, warped
 from selfcorrect.image.exposure import scale_to_one
 
-__all__ = ["averaged", "brightest", "gathered"]
+__all__ = ["averaged", "excess_of", "gathered"]
 
 # What a fetched pixel may differ in: the best of a few on two frames of one shot; `scripts/bench/shot.py` measures what
 # comes of them.
@@ -73,17 +73,20 @@ def averaged(
     return (sum_ / total).clamp(min=0), found
 
 
-def brightest(neighbours: Mapping[int, tuple[Frame, Motion]]) -> Tensor:
-    """The largest mean of the channels that any noisy half of them has where it shows a pixel's surface, (H, W).
+def excess_of(neighbours: Mapping[int, tuple[Frame, Motion]]) -> Tensor:
+    """How far their noisy halves lie above their denoised ones where they show a pixel's surface, (H, W, halves).
 
-    Of paths of great energy: whether others have met them, too. 0 where no motion is believed.
+    By the mean of the channels, and above the darker of the denoised halves, which a path of great energy has not
+    reached; so lights that change do not count. 0 where no motion is believed.
     """
-    most = torch.zeros(())
+    brought = []
     for other, motion in neighbours.values():
+        a, b = (half.mean(-1, keepdim=True) for half in other.candidates[0].halves)
+        usual = torch.minimum(a, b)
         for half in other.color:
-            shown = fetched(half.mean(-1, keepdim=True), motion.offset)[..., 0]
-            most = torch.maximum(shown * motion.known, most.to(shown.device))
-    return most
+            excess = half.mean(-1, keepdim=True) - usual
+            brought.append(fetched(excess, motion.offset) * motion.known[..., None])
+    return torch.cat(brought, -1)
 
 
 def _weight(

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from selfcorrect.frame import Candidate, Frame, mean
-from selfcorrect.history.gather import averaged, brightest, gathered
+from selfcorrect.history.gather import averaged, excess_of, gathered
 from selfcorrect.history.motion import Motion, between, chained, picture
 from selfcorrect.independence import dependence
 
@@ -129,7 +129,7 @@ class Histories:
             history = History(found, left_out, self._told(number, around, frames))
         candidate = Candidate(NAME, (images[0], images[1]), images[2])
         met = {n + number: (frames[n + number], self._motion(number, n + number, frames)) for n in history.found}
-        return frame.with_candidate(candidate).with_seen(brightest(met)), history
+        return frame.with_candidate(candidate).with_seen(excess_of(met)), history
 
     def _lends(self, other: int, number: int, history: History, frames: Mapping[int, Frame]) -> bool:
         """Whether what the next frame has gathered may be averaged in: it shows the same, and nothing of our noise."""

@@ -74,7 +74,7 @@ def test_what_neighbours_have_met_is_known_here() -> None:
     found, _ = with_history(here, {-1: before, 2: after}, identity)
     assert found.seen is not None
     places = torch.nonzero(found.seen > 100)
-    assert places.tolist() == [[30, 40 - STEP], [30, 40 + 2 * STEP]]
+    assert places.tolist() == [[30, 40 - STEP, 0], [30, 40 + 2 * STEP, 3]]
     assert with_history(here, {}, identity)[0].seen is None
 
 
