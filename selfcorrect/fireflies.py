@@ -16,9 +16,11 @@ whose mean is near 1, and ε = 0.1:
 4. The darker half is itself no brighter than that: a lamp or a star that both have met stays, however different.
 5. Nowhere within four pixels is there a pixel of the spot around which the other half's noisy pixels, again within
    four, reach half of the brightest of the spot's own half. In a caustic both meet paths of the same great energy, one
-   here and one beside: however few, they are light. Nor have neighbouring frames met it, along their motion: of the
-   energy E that the spot's own half has there, all other halves have less than a quarter on average, each counted
-   for E at most. The image of both halves shows E / 2 where p E is true: below p = 1/4 nothing is nearer.
+   here and one beside: however few, they are light.
+
+Where neighbouring frames are known, they tell how often such paths are met: of the energy E that the spot's own half
+has there, p E is what all other halves have on average, each counted for E at most, fetched along their motion. The
+image of both halves shows E / 2, so the share 1 − 2 p of it goes, and from p = 1/2 on it is a caustic and stays.
 
 What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
 given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
@@ -42,7 +44,7 @@ _AROUND = 2  # tiles on each side, of which the median is taken
 _GROWN = 2  # pixels
 _WITNESS = 5  # side of the window of noisy pixels
 _SPOT = 4  # pixels from a spot's brightest part
-_REACH = 2 * _GROWN + 3 * _SPOT
+_REACH = 2 * _GROWN + 4 * _SPOT
 _MOST_PIXELS = 2**20  # that tell what is bright, in rows spread evenly over the frame
 _STRICTER = 2.0  # each time too much would go, the threshold is multiplied by this
 _TRIES = 5
@@ -61,7 +63,6 @@ class Rule(NamedTuple):
         darkest: ε.
         doubts: standard errors of the other half's noisy pixels.
         alike: share of a firefly's noisy radiance that the other half's pixels nearby must not reach.
-        often: how often, on average over all other halves, such paths must not be met.
         usual: share of the pixels, 0 … 1, that are darker than what may be a light.
         most: share of the image's light, 0 … 1, that may go.
     """
@@ -72,7 +73,6 @@ class Rule(NamedTuple):
     darkest: float = 0.1
     doubts: float = 2.0
     alike: float = 0.5
-    often: float = 0.25
     usual: float = 0.99
     most: float = 0.01
 
@@ -189,7 +189,11 @@ class _Search:
         found &= _largest_around(found & self._met_by_both(a, b, wide), _SPOT) == 0
         spot = found & (torch.maximum(a, b) > self._usual)
         found &= _largest_around(spot, _SPOT) > 0
-        return _mean_around(_largest_around(found, _GROWN), _GROWN)[inner]
+        share = _mean_around(_largest_around(found, _GROWN), _GROWN)
+        if self._seen is not None:
+            often = _largest_around(found * self._often(self._seen[wide], a, b, wide), _SPOT)
+            share = share * (1 - 2 * often).clamp(min=0)
+        return share[inner]
 
     def _contradicted(self, a: Tensor, b: Tensor, rows: slice) -> Tensor:
         """Whether the noisy pixels of the darker half contradict the brighter one, (rows, W)."""
@@ -202,18 +206,22 @@ class _Search:
         return contradicted
 
     def _met_by_both(self, a: Tensor, b: Tensor, rows: slice) -> Tensor:
-        """Whether noisy pixels nearby, not the brighter half's own, are about as bright as its, (rows, W)."""
-        pair = self._means(self._color, rows)
-        bright, other = torch.where(a > b, pair[0], pair[1]), torch.where(a > b, pair[1], pair[0])
-        met = _largest_around(other, _SPOT) > self._rule.alike * _largest_around(bright, _SPOT)
-        if self._seen is None:
-            return met
+        """Whether the darker half's noisy pixels nearby are about as bright as the brighter one's, (rows, W)."""
+        in_a, in_b = (_largest_around(noisy, _SPOT) for noisy in self._means(self._color, rows))
+        return torch.where(a > b, in_b > self._rule.alike * in_a, in_a > self._rule.alike * in_b)
+
+    def _often(self, seen: Tensor, a: Tensor, b: Tensor, rows: slice) -> Tensor:
+        """p: how often the other halves have met what the brighter one has around each pixel, 0 … 1, (rows, W).
+
+        0 where that is not most of what it has nearby.
+        """
         usual = torch.minimum(a, b)
-        energy, theirs = (_mean_around(noisy - usual, _SPOT) for noisy in (bright, other))
-        seen = (self._seen[rows].double() * self._scale).unbind(-1)
-        halves = [theirs, *(_mean_around(excess, _SPOT) for excess in seen)]
-        capped = torch.stack([torch.minimum(one, energy) for one in halves])
-        return met | (capped.mean(0) > self._rule.often * energy)
+        excess = [_mean_around(noisy - usual, _SPOT) for noisy in self._means(self._color, rows)]
+        energy, theirs = torch.where(a > b, *excess), torch.where(a > b, *reversed(excess))
+        halves = [theirs, *(_mean_around(one, _SPOT) for one in (seen.double() * self._scale).unbind(-1))]
+        met = torch.stack([torch.minimum(one, energy) for one in halves]).mean(0)
+        inside = energy > _largest_around(energy, _SPOT) / 2  # of a window that misses the path nothing can be told
+        return torch.where(inside & (energy > 0), met / energy, 0.0).clamp(0, 1)
 
     def excess(self, image: Radiance, rows: slice) -> Tensor:
         """What to take off rows of an image, (rows, W, 3) ≥ 0."""
