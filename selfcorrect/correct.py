@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -46,6 +46,7 @@ class Result:
         losses: Eq. 8 before each optimiser step.
         seconds: how long each stage took.
         estimate: what the guard says was gained; None where the settings turn it off.
+        shares: of that gain, by candidate, ``stages`` being what the stages made; they sum to 1 where there is one.
         removed: fireflies that were taken out of the corrected colour; None where the settings keep them.
         lone: how many pixels are as the denoiser has them since nothing around them speaks for what both halves show
             (:mod:`selfcorrect.lone_pixels`); 0 without the guard.
@@ -62,6 +63,7 @@ class Result:
     input_scale: float
     start: Start
     lone: int = 0
+    shares: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def image(self) -> Any:
@@ -159,7 +161,7 @@ def correct(
     removed = None
     if settings.fireflies == "remove":
         begun = time.perf_counter()
-        removed = remove_fireflies_(image, frame.color, given.halves, first.full, scale=first.scale)
+        removed = remove_fireflies_(image, frame.color, given.halves, first.full, seen=frame.seen, scale=first.scale)
         if estimate is not None and removed.pixels:
             estimate = estimate.without(removed.error, removed.standard_error)
         seconds["fireflies"] = time.perf_counter() - begun
@@ -174,6 +176,7 @@ def correct(
         input_scale=first.scale,
         start=learned.start if learned else Start(warm=False),
         lone=len(lone),
+        shares=dict(zip([*(c.name for c in more), "stages"], guarded.shares, strict=True)) if guarded else {},
     )
 
 

@@ -14,7 +14,7 @@ from selfcorrect.exr.passes import Others
 from selfcorrect.fireflies import Removed
 from selfcorrect.frame import Frame
 from selfcorrect.guard import Estimate
-from selfcorrect.history import History
+from selfcorrect.history import NAME, History
 from selfcorrect.image.repair import Repairs
 from selfcorrect.settings import Settings
 from selfcorrect.stages.stage import Start
@@ -123,6 +123,7 @@ class Corrected:
         more: what else belongs into the attributes, by name: plain values.
         version: of selfcorrect.
         lone: how many pixels are left to the denoiser, of which nothing around them says what they are.
+        shares: of what was gained, by candidate.
     """
 
     before: Denoised
@@ -140,6 +141,7 @@ class Corrected:
     more: Mapping[str, Any] = field(default_factory=dict)
     version: str = field(default_factory=lambda: version("selfcorrect"))
     lone: int = 0
+    shares: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -161,6 +163,7 @@ class Corrected:
             place=_place(result),
             more=dict(more or {}),
             lone=result.lone,
+            shares=dict(result.shares),
         )
 
     def with_layers(self, name: str, others: "Mapping[str, Corrected]") -> "Corrected":
@@ -194,6 +197,7 @@ class Corrected:
             "estimate": None if self.estimate is None else asdict(self.estimate),
             "fireflies": None if self.removed is None else self.removed._asdict(),
             "lone_pixels": self.lone,
+            "gained_by": dict(self.shares),
             "start": self.start._asdict(),
             **self.more,
         }
@@ -254,6 +258,8 @@ class Written:
                 f"left as the denoiser has them: {self.corrected.lone} pixels that both halves show over a hundred "
                 "times as bright as all around, like stars or fireflies"
             )
+        if (share := self.corrected.shares.get(NAME, 0.0)) > 0:
+            lines.append(f"{100 * share:.0f} % of the gain are the neighbouring frames'")
         if self.clipped:
             lines.append(f"{self.output}: {self.clipped} values beyond the range of half floats were clipped")
         spent = ", ".join(f"{name} {value:.1f} s" for name, value in self.corrected.seconds.items())

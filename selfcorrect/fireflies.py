@@ -21,6 +21,10 @@ whose mean is near 1, and ε = 0.1:
    any of the eight around) that reach half of the brightest. What three pixels have met alike is light, of which one
    half has met more than its share, but the other is further from the truth.
 
+Where neighbouring frames are known, they tell how often such paths are met: of the energy E that the spot's own half
+has there, p E is what all other halves have on average, each counted for E at most, fetched along their motion. The
+image of both halves shows E / 2, so the share 1 − 2 p of it goes, and from p = 1/2 on it is a caustic and stays.
+
 What is found is grown by two pixels and smoothed, since the denoiser has spread the spot. No more light is taken than a
 given share of the image: if need be, only the largest disagreements count. What was made of both halves has no
 witness; `scripts/bench/fireflies.py` measures the rule against references.
@@ -44,7 +48,7 @@ _AROUND = 2  # tiles on each side, of which the median is taken
 _GROWN = 2  # pixels
 _WITNESS = 5  # side of the window of noisy pixels
 _SPOT = 4  # pixels from a spot's brightest part
-_REACH = 2 * _GROWN + 3 * _SPOT + 1
+_REACH = 2 * _GROWN + 4 * _SPOT + 1
 _ROWS = 128  # worked on at a time, with _REACH more on either side
 _MOST_PIXELS = 2**20  # that tell what is bright, in rows spread evenly over the frame
 _STRICTER = 2.0  # each time too much would go, the threshold is multiplied by this
@@ -104,7 +108,14 @@ class Removed(NamedTuple):
 
 
 def remove_fireflies_(
-    image: Tensor, color: Pair, denoised: Pair, denoised_full: Radiance, *, scale: float = 1.0, rule: Rule | None = None
+    image: Tensor,
+    color: Pair,
+    denoised: Pair,
+    denoised_full: Radiance,
+    *,
+    seen: Tensor | None = None,
+    scale: float = 1.0,
+    rule: Rule | None = None,
 ) -> Removed:
     """Remove fireflies from an image that was made of both halves, in place.
 
@@ -113,11 +124,12 @@ def remove_fireflies_(
         color: the noisy halves, like the others of the same shape and units.
         denoised: the denoised halves, each made of one half alone.
         denoised_full: denoised mean of the halves, whose error is told.
+        seen: of neighbouring frames, as :class:`selfcorrect.Frame` has it.
         scale: what brings radiance to a mean near 1.
         rule: by default the one that the module describes.
     """
     rule = rule or Rule()
-    found = _Search(color, denoised, scale, rule)
+    found = _Search(color, denoised, seen, scale, rule)
     before = _mean(image, lambda rows: channel_mean(image[rows].double()))
     for _ in range(_TRIES):
         taken = _mean(image, lambda rows: channel_mean(found.excess(image, rows)))
@@ -152,9 +164,9 @@ class _Search:
         stricter: what the threshold is multiplied by.
     """
 
-    def __init__(self, color: Pair, denoised: Pair, scale: float, rule: Rule):
+    def __init__(self, color: Pair, denoised: Pair, seen: Tensor | None, scale: float, rule: Rule):
         self.stricter = 1.0
-        self._color, self._denoised, self._scale, self._rule = color, denoised, scale, rule
+        self._color, self._denoised, self._seen, self._scale, self._rule = color, denoised, seen, scale, rule
         self._size = (denoised[0].shape[0], denoised[0].shape[1])
         self._spread = _median_around(_tile_quantiles(self._size, self._disagreement, rule.quantile))[None]
         self._usual = self._usual_brightness()
@@ -190,7 +202,11 @@ class _Search:
         found &= _largest_around(light, _SPOT) == 0
         spot = found & (torch.maximum(a, b) > self._usual)
         found &= _largest_around(spot, _SPOT) > 0
-        return _mean_around(_largest_around(found, _GROWN), _GROWN)[inner]
+        share = _mean_around(_largest_around(found, _GROWN), _GROWN)
+        if self._seen is not None:
+            often = _largest_around(found * self._often(self._seen[wide], a, b, wide), _SPOT)
+            share = share * (1 - 2 * often).clamp(min=0)
+        return share[inner]
 
     def _contradicted(self, a: Tensor, b: Tensor, rows: slice) -> Tensor:
         """Whether the noisy pixels of the darker half contradict the brighter one, (rows, W)."""
@@ -220,6 +236,19 @@ class _Search:
         many = torch.zeros_like(found)
         many[found] = highest[:, -1] > self._rule.alike * highest[:, 0]
         return many
+
+    def _often(self, seen: Tensor, a: Tensor, b: Tensor, rows: slice) -> Tensor:
+        """p: how often the other halves have met what the brighter one has around each pixel, 0 … 1, (rows, W).
+
+        0 where that is not most of what it has nearby.
+        """
+        usual = torch.minimum(a, b)
+        excess = [_mean_around(noisy - usual, _SPOT) for noisy in self._means(self._color, rows)]
+        energy, theirs = torch.where(a > b, *excess), torch.where(a > b, *reversed(excess))
+        halves = [theirs, *(_mean_around(one, _SPOT) for one in (seen.double() * self._scale).unbind(-1))]
+        met = torch.stack([torch.minimum(one, energy) for one in halves]).mean(0)
+        inside = energy > _largest_around(energy, _SPOT) / 2  # of a window that misses the path nothing can be told
+        return torch.where(inside & (energy > 0), met / energy, 0.0).clamp(0, 1)
 
     def excess(self, image: Radiance, rows: slice) -> Tensor:
         """What to take off rows of an image, (rows, W, 3) ≥ 0."""

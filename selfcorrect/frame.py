@@ -85,6 +85,8 @@ class Frame:
     Attributes:
         aids: what the denoiser was given beside the colours of both halves together, of half a and of half b, where
             :meth:`denoise` was asked to keep it.
+        seen: (H, W, halves), how far the noisy halves of neighbouring frames lie above what is usual where they show a
+            pixel's surface, by the mean of the channels; None without neighbours.
 
     Raises:
         FrameError: sizes or channel counts do not fit, or a channel of radiance is NaN or infinite at more than half
@@ -103,6 +105,7 @@ class Frame:
     repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
     constant: list[str] = field(init=False, default_factory=list)
     aids: "Aids | None" = field(init=False, default=None)
+    seen: Tensor | None = field(init=False, default=None)
     _like: Any = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -225,9 +228,17 @@ class Frame:
         object.__setattr__(frame, "more", (*self.more, candidate))
         return frame
 
+    def with_seen(self, seen: Tensor) -> "Frame":
+        """This frame with what neighbouring frames have met of it."""
+        frame = self._copy()
+        object.__setattr__(frame, "seen", seen)
+        return frame
+
     def to(self, device: str | torch.device) -> "Frame":
         """This frame with all its tensors on ``device``."""
         frame = self._copy()
+        if self.seen is not None:
+            object.__setattr__(frame, "seen", self.seen.to(device))
         for buffer in BUFFERS:
             if (pair := getattr(self, buffer.name)) is not None:
                 object.__setattr__(frame, buffer.name, tuple(tensor.to(device) for tensor in pair))

@@ -115,12 +115,14 @@ class Guarded:
         estimate: of what was gained.
         alpha: the weight of each candidate over tiles of 16 pixels, (K, h, w).
         errors: the relative squared error before and after over the same, (2, h, w).
+        shares: of the gain, by candidate; their sum is 1, or all are 0 where nothing was gained.
     """
 
     image: Tensor
     estimate: Estimate
     alpha: Tensor
     errors: Tensor
+    shares: tuple[float, ...]
 
     def maps(self) -> tuple[Tensor, Tensor, Tensor]:
         """Each (H, W): the weight of all candidates together, 0 … 1, and the estimated relative squared error of the
@@ -230,7 +232,10 @@ def guard(
     chosen = [pooled(size, partial(evidence.fold, i), count) for i in (0, 1)]
 
     def judged(rows: slice) -> tuple[Tensor, Tensor]:
-        """What one fold's evidence alone would choose is judged by the other's: the gain, with and without w."""
+        """What one fold's evidence alone would choose is judged by the other's: the gain, with and without w.
+
+        By candidate, (K, rows, W).
+        """
         weights = [enlarged_rows(alpha, size, rows) for alpha in chosen]
         alpha = torch.where(evidence.first_fold(rows), weights[1], weights[0])
         gain = [taken_off(alpha, evidence.nd(i, rows)) for i in (0, 1)]
@@ -238,12 +243,14 @@ def guard(
 
     def gains(rows: slice) -> Tensor:
         gain, unweighted = judged(rows)
-        return torch.stack([gain, _metric_weight(denoised_full[rows].double(), scale) * unweighted])
+        weighted = _metric_weight(denoised_full[rows].double(), scale) * unweighted
+        return torch.cat([gain.sum(0, keepdim=True), weighted.sum(0, keepdim=True), weighted])
 
     gain = tile_means(size[0], gains)
     # More than chance, in the weights that decide and in those of the metric.
     means = average(gain, size)
-    improved = all(mean > 0 and _more_than_chance(tiles) for mean, tiles in zip(means, gain, strict=True))
+    improved = all(means[i] > 0 and _more_than_chance(gain[i]) for i in (0, 1))
+    shares = tuple(part / means[1] if improved else 0.0 for part in means[2:])
 
     alpha = pooled(size, evidence.both, count) if improved else gain.new_zeros(count, 1, 1)
     for rows in bands(size[0]):
@@ -260,13 +267,13 @@ def guard(
         crossed = channel_mean((z[0] - y[1]) ** 2 + (z[1] - y[0]) ** 2) / 2
         spread = channel_mean((z[0] - z[1]) ** 2)
         nonlinear = channel_mean(((z[0] + z[1]) / 2 - full) ** 2)
-        gained = judged(rows)[1] if improved else torch.zeros_like(spread)
+        gained = judged(rows)[1].sum(0) if improved else torch.zeros_like(spread)
         # The best image there is says what errors are relative to: where the denoiser has left fireflies or blurred
         # a lamp, its own radiance would hide its error.
         return _metric_weight(_shown(out, rows), scale) * torch.stack([between, crossed, spread, nonlinear, gained])
 
     estimate, errors = _estimate(tile_means(size[0], squares), size, improved)
-    return Guarded(out, estimate, alpha.expand(count, *errors.shape[1:]), errors)
+    return Guarded(out, estimate, alpha.expand(count, *errors.shape[1:]), errors, shares)
 
 
 def _metric_weight(radiance: Tensor, scale: float) -> Tensor:

@@ -42,14 +42,13 @@ def _place(k: int, m: int, candidates: int) -> int:
 
 
 def taken_off(alpha: Tensor, nd: Tensor) -> Tensor:
-    """What weights α take off half the squared error: Σ_k α_k n_k − Σ_kl α_k α_l d_kl / 2."""
+    """What each of the weights α takes off half the squared error, in the shape of α.
+
+    α_k (n_k − Σ_m α_m d_km / 2), whose sum is Σ_k α_k n_k − Σ_km α_k α_m d_km / 2: what two candidates have in common
+    is shared between them.
+    """
     count = len(alpha)
-    gain = alpha[0] * nd[0]
-    for k in range(1, count):
-        gain = gain + alpha[k] * nd[k]
-    for (k, m), d in zip(pairs(count), nd[count:], strict=True):
-        gain = gain - alpha[k] * alpha[m] * d / (2 if k == m else 1)
-    return gain
+    return alpha * (nd[:count] + _left(nd[:count], nd[count:], alpha)) / 2
 
 
 def pooled(size: tuple[int, int], nd: Callable[[slice], Tensor], count: int) -> Tensor:

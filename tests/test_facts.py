@@ -38,6 +38,7 @@ CORRECTED = facts.Corrected(
     threads=2,
     place="mostly in the highlights",
     more={"frame": 3},
+    shares={"history": 0.8, "stages": 0.2},
 )
 WRITTEN = facts.Written("out.exr", 4, Others(3, 2), {"write": 0.01, "total": 2.0}, CORRECTED)
 RUN = {
@@ -47,6 +48,7 @@ RUN = {
     "estimate": asdict(ESTIMATE),
     "fireflies": {"pixels": 0.002, "light": 0.0015, "error": 0.25, "standard_error": 0.125},
     "lone_pixels": 2,
+    "gained_by": {"history": 0.8, "stages": 0.2},
     "start": {"warm": True, "cold_loss": 0.5, "warm_loss": 0.25},
     "frame": 3,
 }
@@ -93,13 +95,16 @@ def test_log() -> None:
         "them",
         "left as the denoiser has them: 2 pixels that both halves show over a hundred times as bright as all around, "
         "like stars or fireflies",
+        "80 % of the gain are the neighbouring frames'",
         "out.exr: 4 values beyond the range of half floats were clipped",
         "other channels: 3 the mean of both halves, 2 as in half a",
         "out.exr: written after 2.0 s (train 1.0 s, infer 0.2 s)",
         "out.exr: error about 25 % lower, mostly in the highlights (relMSE ≈ 0.02 → 0.015, -25 ± 3 %)",
     ]
-    unguarded = replace(WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None, removed=None, lone=0))
-    assert unguarded.lines() == WRITTEN.lines()[3:5]
+    unguarded = replace(
+        WRITTEN, clipped=0, corrected=replace(CORRECTED, estimate=None, removed=None, lone=0, shares={})
+    )
+    assert unguarded.lines() == WRITTEN.lines()[4:6]
     assert unguarded.to_dict()["estimate"] is None
 
 

@@ -126,6 +126,23 @@ def test_light_that_many_pixels_of_its_own_half_have_met_stays(pixels: int, goes
     assert not goes or error(image, clean) - noise < 0.1 * error(before, clean)
 
 
+@pytest.mark.parametrize(("paths", "goes"), [(0, True), (1, True), (5, False)])
+def test_light_that_neighbouring_frames_have_met_stays(paths: int, goes: bool) -> None:
+    """Of nine other halves: what one has met, too, goes but for two ninths; what five have, is what the image shows."""
+    clean, pair = truth(), halves(truth())
+    noisy = [half.clone() for half in pair]
+    pair[0] = pair[0] + spot(SIZE, 40, 50)
+    noisy[0][40, 50] += 80.0
+    seen = 0.02 * torch.randn(*SIZE, 8, generator=torch.Generator().manual_seed(3))
+    seen[43, 46, :paths] += 80.0
+    seen[43, 46, 0] *= 50.0  # a path of far greater energy is one path
+    before = (pair[0] + pair[1]) / 2
+    image, found = removed(pair, noisy, seen=seen)
+    assert (found.pixels > 0) == goes
+    assert goes or torch.equal(image, before)
+    assert not goes or error(image, clean) < 0.1 * error(before, clean)
+
+
 def test_a_caustic_explains_itself() -> None:
     """A region of 60 pixels where the halves disagree, and the noisy ones more, in a frame where they agree."""
     strength = torch.zeros(*SIZE, 1)

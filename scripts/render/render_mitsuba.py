@@ -4,8 +4,10 @@
     python scripts/render/render_mitsuba.py SCENE.xml -o shot --spp 64 --frames 1-24 -D 'angle={2 * frame}'
 
 It writes ``SCENE_a.####.exr`` and ``SCENE_b.####.exr``, half of the samples and another seed each, with albedo,
-shading normal and depth beside the colour. The scene's integrator, sampler and camera stay; its pixel filter becomes a
-box, since a wider one correlates the noise of neighbours, and a film that names no component format stores float.
+shading normal and depth beside the colour; of a shot also the motion to the frames before and after
+(``mitsuba_motion.py``), for which the scene is loaded at those frames as well. The scene's integrator, sampler and
+camera stay; its pixel filter becomes a box, since a wider one correlates the noise of neighbours, and a film that names
+no component format stores float.
 
 ``-D NAME=TEXT`` sets a parameter of the scene (``<default name="NAME" value="…"/>``, used as ``$NAME``). Between braces
 in TEXT stands arithmetic over the frame number: ``{1.5 + sin(frame / 24)}``, ``wood.{frame:04d}.png``. A scene that
@@ -33,6 +35,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from halves import HALVES, add_arguments, path_of, published, seed_of
+from mitsuba_motion import CHANNELS, Layout, hits, layout, motion
 from screened_poisson import screened_poisson
 from variants import LLVM, SCALAR, VariantError, chosen
 
@@ -171,6 +174,59 @@ def render(scene: Any, spp: int, seed: int, integrator: Any = None) -> Any:
     return bitmap
 
 
+class Motions:
+    """Motion of the frames of a shot, and what is known of the frames around.
+
+    Args:
+        path: the scene.
+        parameters: of a frame.
+        size: width and height, where they are given.
+        seed: of the samples that say what a pixel shows.
+    """
+
+    def __init__(self, path: Path, parameters: Any, size: tuple[int, int] | None, seed: int):
+        self._path, self._parameters, self._size, self._seed = path, parameters, size, seed
+        self._known: dict[int, tuple[dict[str, str], Layout | None]] = {}
+
+    def of(self, frame: int, scene: Any) -> np.ndarray:
+        """The channels of a frame, (H, W, 4), of its loaded scene."""
+        self._known = {n: known for n, known in self._known.items() if abs(n - frame) <= 1}
+        parameters = self._parameters(frame)
+        here = layout(scene)
+        self._known[frame] = parameters, here
+        if not _takes_one_sample(scene):
+            scene = load_scene(self._path, parameters, self._size, "independent")
+        met = hits(scene, seed_of(self._seed, frame, "motion"))
+        return motion(met, here, (self._layout(frame - 1), self._layout(frame + 1)))
+
+    def _layout(self, frame: int) -> Layout | None:
+        """None where the scene cannot be loaded, as beyond the last frame of meshes that were exported one by one."""
+        if frame not in self._known:
+            try:
+                parameters = self._parameters(frame)
+                same = [known for other, known in self._known.values() if other == parameters]
+                made = same[0] if same else layout(load_scene(self._path, parameters, self._size))
+                self._known[frame] = parameters, made
+            except RenderError:
+                self._known[frame] = {}, None
+        return self._known[frame][1]
+
+
+def _takes_one_sample(scene: Any) -> bool:
+    """Whether the sampler does not round one sample up, and mix what a pixel shows."""
+    sampler = scene.sensors()[0].sampler()
+    sampler.set_sample_count(1)
+    return bool(sampler.sample_count() == 1)
+
+
+def with_channels(bitmap: Any, names: tuple[str, ...], values: np.ndarray) -> Any:
+    """A bitmap with further channels, (H, W, len(names))."""
+    own = np.array(bitmap, copy=False)
+    together = np.concatenate([own, values.astype(own.dtype)], -1)
+    known = [field.name for field in bitmap.struct_()]
+    return mi.Bitmap(together, mi.Bitmap.PixelFormat.MultiChannel, [*known, *names])
+
+
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Render the two halves of a frame or a shot with Mitsuba 3.")
     parser.add_argument("scene", type=Path, metavar="SCENE.xml")
@@ -187,17 +243,25 @@ def render_shot(options: argparse.Namespace) -> None:
     """Write both halves of every frame."""
     name = options.name or options.scene.stem
     own = {"frame"} if re.search(r"\$frame\b", options.scene.read_text(encoding="utf-8")) else set()
+
+    def parameters_of(number: int) -> dict[str, str]:
+        return dict.fromkeys(own, str(number)) | definitions(options.define, number)
+
+    motions = Motions(options.scene, parameters_of, options.size, options.seed)
     for frame in options.frames or [None]:
         number = 1 if frame is None else frame
-        parameters = dict.fromkeys(own, str(number)) | definitions(options.define, number)
+        parameters = parameters_of(number)
         kinds = ["independent", CRN] if options.poisson else [CRN] if options.crn else [None]
         scenes = [load_scene(options.scene, parameters, options.size, kind) for kind in kinds]
+        moved = None if frame is None else motions.of(frame, scenes[0])
         for half in HALVES:
             started = time.perf_counter()
             seed = seed_of(options.seed, number, half)
             bitmap, *common = (render(scene, options.spp // 2, seed) for scene in scenes)
             if common:
                 _reconstruct(bitmap, common[0])
+            if moved is not None:
+                bitmap = with_channels(bitmap, CHANNELS, moved)
             path = path_of(options.output, name, half, frame)
             with published(path) as temporary:
                 bitmap.write(str(temporary))

@@ -56,6 +56,7 @@ _RGB = 12  # bytes of a pixel of three float32 channels
 _CANDIDATES = 2  # OIDN's other modes
 _MOTIONS = 36  # bytes of a pixel: offsets and whether they are known, to the frames within two and back
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of glibc's mallopt()
+_SEEN = 8  # bytes of a pixel for each frame around: what its halves have met there
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
@@ -191,13 +192,16 @@ def needs(sources: Sources, settings: Settings, *, extra: int = 0, shot: bool = 
     further = _CANDIDATES if settings.guard and settings.candidates != "none" else 0
     candidates = 3 * image * further  # of both halves and of their mean
     stored_channels = sum(len(part.channels) for part in parts)
-    evidence = pixels * 8 * (1 + further + (1 + further) * (2 + further) // 2) if settings.guard else 0
+    history = bool(shot and settings.frame_radius and settings.guard)
+    judged = 1 + further + history
+    evidence = pixels * 8 * (judged + judged * (judged + 1) // 2) if settings.guard else 0
     around = 0.0
     if shot:  # the next frame is read and the last one written meanwhile
         around = half + held + max(stored, half) + 2 * image + 2 * held
-        if settings.frame_radius and settings.guard:
+        if history:
             kept = 2 * half + 6 * image + 3 * aids + _MOTIONS * pixels  # also what was gathered and denoised again
             around += (2 * settings.frame_radius + 2) * kept + 3 * image
+            around += 2 * settings.frame_radius * _SEEN * pixels
         around *= layers
     around += (layers - 1) * (image + (held if _corrects(sources) else 0))
     both, base = 2 * half, BASE + around

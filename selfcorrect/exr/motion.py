@@ -66,6 +66,10 @@ CONVENTIONS = (
         "what its denoiser takes, in raster space: pixels, rows downwards; no file of it was seen here",
     ),
     Convention(
+        "motion", (_XYZW,), ((0, 1), (1, 1)), ((2, 1), (3, 1)), True, "scripts/render, for Mitsuba",
+        "as it is inside; measured: albedo reprojected by it fits (tests/scripts)",
+    ),
+    Convention(
         "motionvector", ((".R", ".G"), (".X", ".Y")), None, _UPWARDS, False, "Arnold",
         "pixels from the shutter's start to its end: of a frame where the shutter begins on it and is 1 long, with "
         "Instantaneous Shutter",

@@ -59,6 +59,7 @@ TABLE = (
     *_rules("kept", "Blender Cycles", "UV", "IndexOB", "IndexMA", "Object Index", "Material Index"),
     *_rules("kept", "Blender Cycles", "Debug *", "Sample Count", "Render Time", "Volume Majorant", "Guiding *"),
     *_rules("kept", "Mitsuba 3, the prefixes of its documentation", "nn", "sh_normal", "dd", "pos", "uv", "shape*"),
+    *_rules("kept", "scripts/render, for Mitsuba", "motion"),
     *_rules("kept", "pbrt-v4", "P", "N", "Ns", "dzdx", "dzdy", "*variance", "u", "v"),
     *_rules("kept", "Arnold", "N_noice", "Z", "Pref", "motionvector", "ID", "AA_*", "cputime", "raycount", "volume_Z"),
     *_rules("kept", "RenderMan", "z", "zfiltered", "zback", "*_mse", "mse", "*_var", "sampleCount", "id", "id2", "__*"),

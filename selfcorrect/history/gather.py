@@ -14,7 +14,7 @@ from selfcorrect.frame import Frame
 from selfcorrect.history.motion import Motion, features, fetched, warped
 from selfcorrect.image.exposure import scale_to_one
 
-__all__ = ["averaged", "gathered"]
+__all__ = ["averaged", "excess_of", "gathered"]
 
 # What a fetched pixel may differ in: the best of a few on two frames of one shot; `scripts/bench/shot.py` measures what
 # comes of them.
@@ -71,6 +71,22 @@ def averaged(
         total += weight
         found[number] = float(weight.mean())
     return (sum_ / total).clamp(min=0), found
+
+
+def excess_of(neighbours: Mapping[int, tuple[Frame, Motion]]) -> Tensor:
+    """How far their noisy halves lie above their denoised ones where they show a pixel's surface, (H, W, halves).
+
+    By the mean of the channels, and above the darker of the denoised halves, which a path of great energy has not
+    reached; so lights that change do not count. 0 where no motion is believed.
+    """
+    brought = []
+    for other, motion in neighbours.values():
+        a, b = (half.mean(-1, keepdim=True) for half in other.candidates[0].halves)
+        usual = torch.minimum(a, b)
+        for half in other.color:
+            excess = half.mean(-1, keepdim=True) - usual
+            brought.append(fetched(excess, motion.offset) * motion.known[..., None])
+    return torch.cat(brought, -1)
 
 
 def _weight(

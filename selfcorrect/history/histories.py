@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from selfcorrect.frame import Candidate, Frame, mean
-from selfcorrect.history.gather import averaged, gathered
+from selfcorrect.history.gather import averaged, excess_of, gathered
 from selfcorrect.history.motion import Motion, between, chained, picture
 from selfcorrect.independence import dependence
 
@@ -113,18 +113,30 @@ class Histories:
         if self._denoiser is not None and not history.found:
             return frame, history
         around, left_out = self._neighbours(number, frames, 1 if self._denoiser is not None else self._radius)
-        if not around:
-            return frame, History({}, left_out)
-        others = {n: self._candidate(n, frames)[0] for n in around}
+        if self._denoiser is None:
+            if not around:
+                return frame, History({}, left_out)
+            others = {n: frames[n].candidates[0] for n in around}
+        else:
+            others = {n: self._candidate(n, frames)[0] for n in around if self._lends(n, number, history, frames)}
         images, found = [], dict[int, float]()
         for which in (0, 1, 2):  # half a, half b, both
-            given = {n: (frames[n], self._motion(number, n, frames), _images(others[n])[which]) for n in around}
+            given = {n: (frames[n], self._motion(number, n, frames), _images(others[n])[which]) for n in others}
             image, found = averaged(frames[number], _images(mine)[which], given)
             images.append(image)
         if self._denoiser is None:
             found = {n - number: share for n, share in found.items()}
             history = History(found, left_out, self._told(number, around, frames))
-        return frame.with_candidate(Candidate(NAME, (images[0], images[1]), images[2])), history
+        candidate = Candidate(NAME, (images[0], images[1]), images[2])
+        met = {n + number: (frames[n + number], self._motion(number, n + number, frames)) for n in history.found}
+        return frame.with_candidate(candidate).with_seen(excess_of(met)), history
+
+    def _lends(self, other: int, number: int, history: History, frames: Mapping[int, Frame]) -> bool:
+        """Whether what the next frame has gathered may be averaged in: it shows the same, and nothing of our noise."""
+        if other - number not in history.found:
+            return False
+        sources = [other + distance for distance in self._candidate(other, frames)[1].found]
+        return not any(self._shared_noise(number, n, frames) for n in sources if n != number)
 
     def _with_aids(self, number: int, frame: Frame) -> Frame:
         """With the G-buffers as the denoiser gets them: what is compared is cleaner, and prefiltered once."""
@@ -147,20 +159,27 @@ class Histories:
         around, left_out = self._neighbours(number, frames, self._radius)
         if not around:
             return given, History({}, left_out)
-        neighbours = {n: (frames[n], self._motion(number, n, frames)) for n in around}
-        halves, found = [], dict.fromkeys(around, 0.0)
-        for i in (0, 1):
-            half, weights = gathered(frame, neighbours, i)
-            halves.append(half)
-            found = {n: found[n] + weights[n] / 2 for n in around}
-        if max(found.values()) < _LEAST_FOUND:
-            return given, History({}, left_out | {n - number: "shows something else" for n in around})
+        halves, found = self._gathered_from(number, around, frames)
+        while unlike := _unlike(number, found):
+            left_out |= {n - number: "shows something else, or lies beyond what does" for n in unlike}
+            around = [n for n in around if n not in unlike]
+            if not around:
+                return given, History({}, left_out)
+            halves, found = self._gathered_from(number, around, frames)
         full, a, b = (
             torch.as_tensor(self._denoiser(color, **aids)).clamp(min=0)
             for color, aids in zip((mean((halves[0], halves[1])), *halves), frame.aids or (), strict=True)
         )
         found = {n - number: share for n, share in found.items()}
         return Candidate(NAME, (a, b), full), History(found, left_out, self._told(number, around, frames))
+
+    def _gathered_from(
+        self, number: int, around: list[int], frames: Mapping[int, Frame]
+    ) -> tuple[tuple[torch.Tensor, torch.Tensor], dict[int, float]]:
+        """Both halves with the samples of these frames, and the weight of the pixels of each on average."""
+        neighbours = {n: (frames[n], self._motion(number, n, frames)) for n in around}
+        (a, in_a), (b, in_b) = (gathered(frames[number], neighbours, i) for i in (0, 1))
+        return (a, b), {n: (in_a[n] + in_b[n]) / 2 for n in around}
 
     def _neighbours(self, number: int, frames: Mapping[int, Frame], radius: int) -> tuple[list[int], dict[int, str]]:
         """Those that can be used, and why the others cannot. A frame of another size ends the search on its side."""
@@ -224,6 +243,12 @@ def with_history(
         MissingPackageError: there is no optical flow.
     """
     return Histories(radius, denoiser).of(0, {0: frame, **neighbours})
+
+
+def _unlike(number: int, found: Mapping[int, float]) -> set[int]:
+    """The frames that show something else, as after a cut, and those beyond them."""
+    cuts = [n for n, weight in found.items() if weight < _LEAST_FOUND]
+    return {n for n in found for cut in cuts if n == cut or (n > cut > number) or (n < cut < number)}
 
 
 def _told(one: int, other: int, frames: Mapping[int, Frame]) -> torch.Tensor | None:

@@ -54,6 +54,15 @@ def mirror(number: int) -> Truth:
     return radiance, albedo
 
 
+def glass_ball(number: int) -> Truth:
+    """The camera pans by three pixels a frame; the ball shows what is behind it mirrored, and twice as fast."""
+    albedo = window(texture(), 30 + 3 * number)
+    y, x = torch.meshgrid(torch.arange(SIZE[0]) - 32, torch.arange(SIZE[1]) - 60 + 3 * number, indexing="ij")
+    ball = (y**2 + x**2 < 20**2)[..., None]
+    behind = window(texture(1), 50 - 6 * number).flip(1)
+    return torch.where(ball, behind, albedo), torch.where(ball, torch.ones(()), albedo)
+
+
 def texture_moves(number: int) -> Truth:
     """On still geometry, in emitted light that no G-buffer knows."""
     albedo = window(texture(), 30)
@@ -90,7 +99,7 @@ def pan(number: int) -> Truth:
     return albedo, albedo
 
 
-SCENES = (light_switches, shadow_moves, mirror, texture_moves, disocclusion, cut, sky_changes)
+SCENES = (light_switches, shadow_moves, mirror, glass_ball, texture_moves, disocclusion, cut, sky_changes)
 
 
 def demodulated(color: Tensor, albedo: Tensor, normal: Tensor | None = None) -> Tensor:
@@ -148,6 +157,16 @@ def test_and_what_can_be_gained_is(scene: Scene) -> None:
     denoised, candidate, output = errors(scene, {n: frame(scene, n) for n in range(5)})
     assert candidate < 0.6 * denoised
     assert output < 0.7 * denoised
+
+
+def test_it_is_told_whose_the_gain_is() -> None:
+    """A core of two steps has hardly learned anything."""
+    remembered, _ = Histories(2, demodulated).of(HERE, {n: frame(still, n) for n in range(5)})
+    shares = correct(remembered, SETTINGS).shares
+    assert list(shares) == ["history", "stages"]
+    assert sum(shares.values()) == pytest.approx(1)
+    assert shares["history"] > 0.8
+    assert list(correct(frame(still, HERE), SETTINGS).shares) == ["stages"]
 
 
 def test_frames_in_the_wrong_order_do_no_harm() -> None:

@@ -8,7 +8,8 @@ from torch import Tensor
 import denoisers
 from selfcorrect import Frame
 from selfcorrect.history import with_history
-from selfcorrect.history.motion import between, fetched
+from selfcorrect.history.gather import gathered
+from selfcorrect.history.motion import between, fetched, picture
 
 SIZE, STEP = (64, 96), 3  # pixels that the picture moves to the left from frame to frame
 
@@ -64,6 +65,19 @@ def test_half_a_knows_nothing_of_half_b() -> None:
     assert not torch.equal(first[1], second[1])
 
 
+def test_what_neighbours_have_met_is_known_here() -> None:
+    """A bright path of either half, where its surface is in this frame; and of no half of this frame."""
+    here, before, after = (frame(n)[0] for n in (2, 1, 4))
+    for i, other in enumerate((before, after)):
+        other.color[i][30, 40] = 900.0
+    here.color[0][20, 20] = 900.0
+    found, _ = with_history(here, {-1: before, 2: after}, identity)
+    assert found.seen is not None
+    places = torch.nonzero(found.seen > 100)
+    assert places.tolist() == [[30, 40 - STEP, 0], [30, 40 + 2 * STEP, 3]]
+    assert with_history(here, {}, identity)[0].seen is None
+
+
 def test_what_does_not_fit_is_left_alone() -> None:
     """A light that goes out, and a cut: hardly anything of the neighbour is taken."""
     here, truth = frame(2)
@@ -90,6 +104,37 @@ def test_what_is_no_neighbour_is_left_out_and_told() -> None:
     assert "history: the frame at -1 is of 6x5 pixels; left out" in history.lines()
     same, history = with_history(here, {}, identity)
     assert same is here
+
+
+def test_the_same_noise_in_a_neighbours_neighbour_is_seen() -> None:
+    """Frame +3 has half b's noise in its half a; the next frame has gathered it, so it lends nothing."""
+    frames = {distance: frame(2 + distance)[0] for distance in (0, 1, 2, 3)}
+    here, far = frames[0], frames[3]
+    noise = here.color[1] / texture()[:, 36:132] - 1
+    color = (texture()[:, 45:141] * (1 + noise), far.color[1])
+    crossed = Frame(color=color, albedo=far.albedo).denoise(denoisers.create("box"))
+    found, _ = with_history(here, {1: frames[1], 2: frames[2], 3: crossed}, identity)
+    around = {n: (frames[n], between(picture(here), picture(frames[n]))[0]) for n in (1, 2)}
+    assert torch.equal(found.more[0].halves[0], gathered(here, around, 0)[0])
+    usual, _ = with_history(here, {1: frames[1], 2: frames[2], 3: far}, identity)
+    assert not torch.equal(usual.more[0].halves[0], found.more[0].halves[0])
+
+
+def test_a_frame_that_is_missing_does_not_hide_the_one_beyond_it() -> None:
+    here, truth = frame(2)
+    found, history = with_history(here, {-2: frame(0)[0], 2: frame(4)[0]}, identity)
+    assert list(history.found) == [-2, 2]
+    assert error(found.more[0].full, truth) < 0.6 * error((here.color[0] + here.color[1]) / 2, truth)
+
+
+def test_a_cut_ends_the_history_on_its_side() -> None:
+    """Beyond it nothing is looked for, though it may show this frame again."""
+    here, after = frame(2)[0], frame(3)[0]
+    night = {name: tuple(0.05 * image for image in getattr(after, name)) for name in ("color", "albedo")}
+    other = Frame(**night).denoise(denoisers.create("box"))
+    _, history = with_history(here, {-1: frame(1)[0], 1: other, 2: frame(4)[0]}, identity)
+    assert list(history.found) == [-1]
+    assert history.left_out == dict.fromkeys((1, 2), "shows something else, or lies beyond what does")
 
 
 def test_the_same_noise_in_the_other_half_is_seen() -> None:
