@@ -1,5 +1,6 @@
 """The AOVs of a frame's files, corrected, as channels to write: what was planned, one set after the other."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,8 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from selfcorrect.aovs import AovSum, Denoise, correct_alone, correct_aovs
+from selfcorrect.aovs import AovSum, Corrected, Denoise, correct_alone, correct_aovs, correct_sums
 from selfcorrect.exr.aovs import Group, Halves, Plan, planes_of, written_color
+from selfcorrect.exr.decompositions import Aov
 from selfcorrect.exr.file import ExrFile, Pixels
 from selfcorrect.frame import Frame
 
@@ -22,12 +24,14 @@ class Channels(NamedTuple):
         planes: full name → (height, width) array in the types of half a.
         lines: what the log says of them.
         facts: by name of a sum, how far it was from the picture in the noisy halves, how large the gap was that was
-            divided, and what is left of it, as shares of the picture.
+            divided, and what is left of it, as shares of the picture; and how far the picture moved to their sum.
+        picture: what they sum to, (H, W, 3): the corrected picture, where sums were better with what it took of them.
     """
 
     planes: dict[str, Pixels]
     lines: list[str]
     facts: dict[str, dict[str, float]]
+    picture: Tensor
 
 
 def correct_channels(
@@ -37,6 +41,7 @@ def correct_channels(
     frame: Frame,
     denoise: Denoise,
     *,
+    corrected_halves: tuple[Tensor, Tensor] | None = None,
     pass_through: bool = False,
 ) -> Channels:
     """Correct the AOVs that were planned.
@@ -47,17 +52,26 @@ def correct_channels(
         image: the corrected picture, (H, W, 3) linear radiance, NumPy or torch.
         frame: the denoised frame that it was made of.
         denoise: see :func:`selfcorrect.aovs.denoiser_of`.
+        corrected_halves: of the picture, see :func:`selfcorrect.correct_aovs`.
         pass_through: colours that AOVs were divided by are written as half a has them.
 
     Raises:
         FrameError: an AOV is of another size than the frame, or hardly finite.
     """
-    found, done = Channels({}, [], {}), dict[str, Tensor]()
-    target = torch.as_tensor(image).float().cpu()
+    through = _Through(halves, frame, denoise, pass_through=pass_through)
+    own = _apart(plan.groups)
+    first = correct_sums(image, frame, [through.sum_of(g, g.aovs) for g in own], denoise, corrected_halves)
+    made = {group.name: corrected for group, corrected in zip(own, first, strict=True)}
+    found, done = Channels({}, [], {}, first[0].picture if first else torch.as_tensor(image)), dict[str, Tensor]()
+    del first
     for i, group in enumerate(plan.groups):
         later = {aov.name for other in plan.groups[i + 1 :] for aov in other.aovs}
         if group.sums:
-            images = _sum(halves, group, target, done, frame, denoise, found, pass_through=pass_through)
+            corrected = made.pop(group.name, None) or through.rest(group, found.picture, done)
+            found.facts[group.name], lines = _told(group, corrected)
+            found.lines.extend(lines)
+            images = corrected.images
+            del corrected
         else:
             pairs = Halves(*halves, group.aovs)
             images = {name: correct_alone(frame, name, pairs[name], denoise) for name in pairs}
@@ -72,40 +86,62 @@ def correct_channels(
     return found
 
 
-def _sum(
-    halves: tuple[ExrFile, ExrFile],
-    group: Group,
-    target: Tensor,
-    done: dict[str, Tensor],
-    frame: Frame,
-    denoise: Denoise,
-    found: Channels,
-    *,
-    pass_through: bool,
-) -> dict[str, Tensor]:
-    """The AOVs of a group that sums, but those that an earlier one has made sum; adds to the lines and facts found."""
-    shared = [aov.name for aov in group.aovs if aov.name in done]
-    own = [aov for aov in group.aovs if aov.name not in shared]
-    rest = target
-    for name in shared:
-        rest = rest - done[name]
-    colors = {
-        aov.name: torch.from_numpy(written_color(*halves, aov, pass_through=pass_through))
-        for aov in own
-        if aov.color is not None
-    }
-    sums = AovSum(group.name, Halves(*halves, own), group.remainder, colors)
-    corrected = correct_aovs(rest.clamp(min=0), frame, sums, denoise)
-    found.facts[group.name] = {
+class _Through:
+    """What the sums of a frame's files have in common."""
+
+    def __init__(self, halves: tuple[ExrFile, ExrFile], frame: Frame, denoise: Denoise, *, pass_through: bool):
+        self._halves, self._frame, self._denoise, self._pass_through = halves, frame, denoise, pass_through
+
+    def sum_of(self, group: Group, aovs: Sequence[Aov]) -> AovSum:
+        """AOVs of a group, with the colours that they will be divided by."""
+        colors = {
+            aov.name: torch.from_numpy(written_color(*self._halves, aov, pass_through=self._pass_through))
+            for aov in aovs
+            if aov.color is not None
+        }
+        return AovSum(group.name, Halves(*self._halves, aovs), group.remainder, colors)
+
+    def rest(self, group: Group, picture: Tensor, done: dict[str, Tensor]) -> Corrected:
+        """The AOVs of a group but those that an earlier one has made sum, which stay."""
+        shared = [aov.name for aov in group.aovs if aov.name in done]
+        own = [aov for aov in group.aovs if aov.name not in shared]
+        left = picture
+        for name in shared:
+            left = left - done[name]
+        return correct_aovs(left.clamp(min=0), self._frame, self.sum_of(group, own), self._denoise)
+
+
+def _apart(groups: Sequence[Group]) -> list[Group]:
+    """Groups that sum and share no AOV with an earlier one of them."""
+    found, names = list[Group](), set[str]()
+    for group in groups:
+        own = {aov.name for aov in group.aovs}
+        if group.sums and not own & names:
+            found.append(group)
+        if group.sums:
+            names |= own
+    return found
+
+
+def _told(group: Group, corrected: Corrected) -> tuple[dict[str, float], list[str]]:
+    """The facts and the log's lines of a sum."""
+    facts = {
         "noisy": max(group.closing, default=0.0),
         "gap": corrected.gap,
         "left": corrected.closing,
+        "moved": corrected.moved,
     }
-    found.lines.append(
+    lines = []
+    if corrected.moved > 0:
+        lines.append(
+            f"AOVs: {group.name}: the picture takes {100 * corrected.moved:.2g} % of what their sum has otherwise, "
+            "where the halves are certain of it"
+        )
+    lines.append(
         f"AOVs: {group.name}: missed the picture by {100 * corrected.gap:.2g} %, which was divided among them; "
         f"now within {corrected.closing:.1e}"
     )
-    return corrected.images
+    return facts, lines
 
 
 def _alpha(halves: tuple[ExrFile, ExrFile], name: str, frame: Frame, denoise: Denoise) -> Pixels:

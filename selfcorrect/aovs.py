@@ -6,7 +6,10 @@ Two steps make of them what sums:
 1. The guard (:mod:`selfcorrect.guard`), an AOV's own halves its witness, blends the noisy mean in as far as they
    confirm it: x_k, and x_k^a, x_k^b. Passes that hardly have noise, such as emission and the environment, are better
    than what a denoiser makes of them.
-2. The corrected picture c and Σ_k x_k leave a gap. It is divided, the minimum-variance estimate under constraints:
+2. The picture moves towards Σ_k x_k where its halves are certain that this is better (:mod:`selfcorrect.sums`): what
+   sums to the picture takes its errors on, and where they are large, such as around a lamp, the division of the gap
+   made AOVs worse than they were denoised alone. This needs the halves of the corrected picture.
+3. The corrected picture c and Σ_k x_k leave a gap. It is divided, the minimum-variance estimate under constraints:
 
        minimise Σ_k (o_k - x_k)² / v_k   subject to   Σ_k o_k = c,   o_k ≥ 0,
        v_k = M_k (mean_rgb(x_k)² + 0.3),   M_k = mean over pixels of ‖x_k^a - x_k^b‖² / (mean_rgb(x_k)² + 0.3),
@@ -39,8 +42,18 @@ from selfcorrect.image.bands import average, bands, enlarged_rows, tile_means, w
 from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.image.repair import Repairs
+from selfcorrect.sums import toward_sum_
 
-__all__ = ["AovSum", "Corrected", "Denoise", "correct_alone", "correct_aovs", "denoiser_of", "reconciled"]
+__all__ = [
+    "AovSum",
+    "Corrected",
+    "Denoise",
+    "correct_alone",
+    "correct_aovs",
+    "correct_sums",
+    "denoiser_of",
+    "reconciled",
+]
 
 Pair = tuple[Any, Any]
 Denoise = Callable[[Pair], tuple[tuple[Tensor, Tensor], Tensor]]
@@ -78,12 +91,16 @@ class Corrected(NamedTuple):
         repairs: by name, how many pixels were changed on the way in.
         gap: the root of the mean of the squared gap that was divided, relative to that of the picture.
         closing: the same of what is left.
+        picture: what they sum to, (H, W, 3): the corrected picture as given, or moved towards their sum.
+        moved: how far, 0 … 1, as a mean over the frame.
     """
 
     images: dict[str, Tensor]
     repairs: dict[str, Repairs]
     gap: float
     closing: float
+    picture: Tensor
+    moved: float = 0.0
 
 
 def denoiser_of(frame: Frame, denoiser: Callable[..., Any]) -> Denoise:
@@ -106,7 +123,9 @@ def denoiser_of(frame: Frame, denoiser: Callable[..., Any]) -> Denoise:
     return each
 
 
-def correct_aovs(image: Any, frame: Frame, sums: AovSum, denoise: Denoise) -> Corrected:
+def correct_aovs(
+    image: Any, frame: Frame, sums: AovSum, denoise: Denoise, halves: tuple[Tensor, Tensor] | None = None
+) -> Corrected:
     """Denoise the AOVs of a sum and make them sum to the corrected picture.
 
     Args:
@@ -114,22 +133,46 @@ def correct_aovs(image: Any, frame: Frame, sums: AovSum, denoise: Denoise) -> Co
         frame: the denoised frame that it was made of.
         sums: the AOVs.
         denoise: see :func:`denoiser_of`.
+        halves: those of the corrected picture, of ``correct(…, keep_halves=True)``. With them, the picture itself moves
+            towards the sum where they are certain that this is better; without, it stays as it is, and AOVs take all
+            of its errors on.
 
     Returns:
-        The AOVs. The same input gives the same bits.
+        The AOVs, and the picture that they sum to. The same input gives the same bits.
 
     Raises:
         FrameError: an AOV is of another size than the frame, or hardly finite.
     """
+    return correct_sums(image, frame, [sums], denoise, halves)[0]
+
+
+def correct_sums(
+    image: Any, frame: Frame, sums: Sequence[AovSum], denoise: Denoise, halves: tuple[Tensor, Tensor] | None = None
+) -> list[Corrected]:
+    """As :func:`correct_aovs`, with several sums that have no AOV in common: all sum to the same picture."""
     target = checked(COLOR, (image,), ["the corrected picture"], frame.size)[0][0].cpu()
     scale = scale_to_one(frame.candidates[0].halves)
-    parts, repairs = dict[str, _Part](), dict[str, Repairs]()
-    for name, (halves, counts) in _noisy(frame, sums):
-        parts[name] = _part(halves, denoise, scale, sums.colors.get(name))
-        if name:
-            repairs[name] = counts
-    gap, closing = _reconcile_(list(parts.values()), target)
-    return Corrected({name: part.x for name, part in parts.items() if name}, repairs, gap, closing)
+    if halves is not None:
+        target, halves = target.clone(), (halves[0].cpu().clone(), halves[1].cpu().clone())
+    color = (frame.color[0].cpu(), frame.color[1].cpu())
+    made, repairs, moved = list[dict[str, _Part]](), list[dict[str, Repairs]](), list[float]()
+    for one in sums:
+        totals = None if halves is None else (torch.zeros_like(target), torch.zeros_like(target))
+        parts, counted = dict[str, _Part](), dict[str, Repairs]()
+        for name, (noisy, counts) in _noisy(frame, one):
+            parts[name] = _part(noisy, denoise, scale, one.colors.get(name), totals)
+            if name:
+                counted[name] = counts
+        if halves is not None and totals is not None:
+            moved.append(toward_sum_(target, halves, _Total(list(parts.values())), totals, color, scale))
+        made.append(parts)
+        repairs.append(counted)
+    found = []
+    for i, parts in enumerate(made):
+        gap, closing = _reconcile_(list(parts.values()), target)
+        images = {name: part.x for name, part in parts.items() if name}
+        found.append(Corrected(images, repairs[i], gap, closing, target, moved[i] if moved else 0.0))
+    return found
 
 
 def correct_alone(frame: Frame, name: str, halves: Pair, denoise: Denoise) -> Tensor:
@@ -139,7 +182,7 @@ def correct_alone(frame: Frame, name: str, halves: Pair, denoise: Denoise) -> Te
 
 
 def reconciled(x: Tensor, v: Tensor, target: Tensor) -> Tensor:
-    """The o of step 2.
+    """The o of step 3.
 
     Args:
         x: (K, …) ≥ 0.
@@ -171,7 +214,7 @@ class _Part:
         x: step 1, (H, W, 3); made to sum in place.
         there: where it may have light: (H, W, 1), or (H, W, 3) with a colour.
         color: what it will be divided by.
-        spread: M of step 2.
+        spread: M of step 3.
         darkest: 0.3 of its formulas, in the units of x.
     """
 
@@ -193,6 +236,16 @@ class _Part:
         return torch.ones_like(like) if self.color is None else (self.color[rows] > 0).double()
 
 
+class _Total:
+    """The sum of AOVs, made where it is read."""
+
+    def __init__(self, parts: Sequence[_Part]):
+        self._parts, self.shape = parts, parts[0].x.shape
+
+    def __getitem__(self, rows: slice) -> Tensor:
+        return torch.stack([part.x[rows] for part in self._parts]).double().sum(0)
+
+
 def _noisy(frame: Frame, sums: AovSum) -> Iterator[tuple[str, tuple[tuple[Tensor, Tensor], Repairs]]]:
     """Every AOV's halves in turn, and, without a name, what they leave of the picture."""
     left = [half.clone() for half in frame.color] if sums.remainder else []
@@ -211,8 +264,14 @@ def _checked(frame: Frame, name: str, halves: Pair) -> tuple[tuple[Tensor, Tenso
     return (a, b), counts
 
 
-def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: Tensor | None) -> _Part:
-    """Step 1: an AOV denoised and blended, as a whole and of each half."""
+def _part(
+    halves: tuple[Tensor, Tensor],
+    denoise: Denoise,
+    scale: float,
+    color: Tensor | None,
+    totals: tuple[Tensor, Tensor] | None = None,
+) -> _Part:
+    """Step 1: an AOV denoised and blended, as a whole and of each half; its halves are added to the ``totals``."""
     size = (halves[0].shape[0], halves[0].shape[1])
     there = torch.cat([_there(halves, color, rows) for rows in bands(size[0])])
     darkest = _DARKEST / scale**2
@@ -230,12 +289,19 @@ def _part(halves: tuple[Tensor, Tensor], denoise: Denoise, scale: float, color: 
     for rows in bands(size[0]):
         x[rows] = torch.where(there[rows], x[rows], 0.0)
 
+    def blended(i: int, rows: slice) -> Tensor:
+        """x of one half, of a mean near 1."""
+        alpha, own = enlarged_rows(guarded.alpha, size, rows)[0][:, :, None], z[i][rows].double()
+        return torch.where(there[rows], (own + alpha * (y[i][rows].double() - own)).clamp(min=0), 0.0)
+
     def differences(rows: slice) -> Tensor:
         """‖x^a - x^b‖², relative."""
-        alpha = enlarged_rows(guarded.alpha, size, rows)[0][:, :, None]
-        a, b = (z[i][rows].double() + alpha * (y[i][rows].double() - z[i][rows].double()) for i in (0, 1))
-        squared = channel_mean(torch.where(there[rows], (a - b) ** 2, 0.0))
+        squared = channel_mean((blended(0, rows) - blended(1, rows)) ** 2)
         return (squared / (channel_mean(scale * x[rows].double()) ** 2 + _DARKEST))[None]
+
+    for i, total in enumerate(totals or ()):
+        for rows in bands(size[0]):
+            total[rows] += (blended(i, rows) / scale).float()
 
     (spread,) = average(tile_means(size[0], differences), size)
     return _Part(x, there, color, spread + _LEAST, darkest)

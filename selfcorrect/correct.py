@@ -14,6 +14,7 @@ from selfcorrect.errors import DeviceError, FrameError
 from selfcorrect.fireflies import Removed, remove_fireflies_
 from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
+from selfcorrect.image.bands import bands, enlarged_rows
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.independence import dependence
 from selfcorrect.kernel.compiled import warn_if_missing
@@ -52,6 +53,8 @@ class Result:
             (:mod:`selfcorrect.lone_pixels`); 0 without the guard.
         input_scale: what radiance was multiplied by.
         start: whether training went on from ``warm_start``, and why.
+        halves: what the output would be of each half alone, (H, W, 3) linear radiance ≥ 0 on the CPU, before fireflies
+            are removed and light is kept; where they were asked for and the guard is on.
     """
 
     outputs: Mapping[str, Any]
@@ -64,6 +67,7 @@ class Result:
     start: Start
     lone: int = 0
     shares: Mapping[str, float] = field(default_factory=dict)
+    halves: tuple[Tensor, Tensor] | None = None
 
     @property
     def image(self) -> Any:
@@ -105,6 +109,7 @@ def correct(
     stop: Callable[[], bool] | None = None,
     opened: Sequence[Stage] | None = None,
     extra: Mapping[str, Images] | None = None,
+    keep_halves: bool = False,
 ) -> Result:
     """Correct a denoised frame (Back et al. 2022).
 
@@ -120,6 +125,7 @@ def correct(
             (:func:`selfcorrect.stages.opened`).
         extra: by name of a stage, what it needs beyond the halves, such as the
             :class:`selfcorrect.stages.deep_combiner_4.SubImages` of deep-combiner-4, on any device.
+        keep_halves: also give the corrected halves, which :func:`selfcorrect.correct_aovs` has use for.
 
     Returns:
         The corrected image and the network. The same seed gives the same bits on the same machine and number of
@@ -149,7 +155,7 @@ def correct(
         return _kept(frame, first)
     lone = lone_pixels(frame.halves, first.scale) if settings.guard else torch.empty(0, 2)
     first = first._replace(halves=set_aside(first.halves, lone))
-    judge = _Judge(first, more) if settings.guard else None
+    judge = _Judge(first, more, keep_halves=keep_halves) if settings.guard else None
     work = Work(warm_start=warm_start, progress=progress, stop=stop)
     state, learned, seconds = _through(opened, first, work, extra or {}, judge)
     image, guarded = state.full.clamp(min=0), None
@@ -177,6 +183,7 @@ def correct(
         start=learned.start if learned else Start(warm=False),
         lone=len(lone),
         shares=dict(zip([*(c.name for c in more), "stages"], guarded.shares, strict=True)) if guarded else {},
+        halves=judge.halves if judge is not None else None,
     )
 
 
@@ -218,8 +225,12 @@ def _kept(frame: Frame, first: StageImages) -> Result:
 class _Judge:
     """The guard on one frame: what the stages make of it, and further candidates, against what the denoiser had."""
 
-    def __init__(self, first: StageImages, more: Sequence[Candidate]):
+    def __init__(self, first: StageImages, more: Sequence[Candidate], *, keep_halves: bool = False):
         self._first = first
+        self.halves: tuple[Tensor, Tensor] | None = None
+        if keep_halves:
+            a, b = (torch.empty(first.full.shape) for _ in "ab")
+            self.halves = a, b
         self._full = [Scaled(c.full, first.scale) for c in more]
         self._halves = [tuple(Scaled(half, first.scale) for half in c.halves) for c in more]
         self._evidence = Evidence(first.scaled_color, first.scaled_images, 1 + len(more))
@@ -228,6 +239,8 @@ class _Judge:
         """Gather from rows of the halves that the stages made."""
         others = [(a[rows], b[rows]) for a, b in self._halves]
         self._evidence.add(rows, *others, halves)
+        for kept, half in zip(self.halves or (), halves, strict=False):
+            kept[rows] = half.to(kept.device)
 
     def blend(self, state: StageImages, image: Tensor) -> tuple[Tensor, Guarded]:
         """The output, made of ``image`` and the other candidates; ``image`` is used up."""
@@ -238,7 +251,21 @@ class _Judge:
         full = Scaled(first.full, first.scale)
         scale_(image, first.scale)
         guarded = guard(evidence, full, [*self._full, image], scale=first.scale, out=image)
+        self._blend_halves_(guarded.alpha)
         if not guarded.estimate.improved:
             return image.copy_(first.full), guarded  # not the frame's own tensor: the caller may change the result
         keep_light_(image, full, first.scaled_color)
         return scale_(image, 1 / first.scale).clamp_(min=0), guarded
+
+    def _blend_halves_(self, alpha: Tensor) -> None:
+        """Blend the halves that are kept as the image is."""
+        for i, kept in enumerate(self.halves or ()):
+            size = (kept.shape[0], kept.shape[1])
+            images = [pair[i] for pair in self._halves]
+            for rows in bands(size[0]):
+                z, weights = self._first.scaled_images[i][rows].double(), enlarged_rows(alpha, size, rows)
+                changes = [*(image[rows].to(z) for image in images), kept[rows].to(z)]
+                blend = z
+                for weight, change in zip(weights, changes, strict=True):
+                    blend = blend + weight[:, :, None] * (change - z)
+                kept[rows] = (blend / self._first.scale).clamp(min=0).to(kept)

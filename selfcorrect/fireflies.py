@@ -243,8 +243,8 @@ class _Search:
         0 where that is not most of what it has nearby.
         """
         usual = torch.minimum(a, b)
-        excess = [_mean_around(noisy - usual, _SPOT) for noisy in self._means(self._color, rows)]
-        energy, theirs = torch.where(a > b, *excess), torch.where(a > b, *reversed(excess))
+        in_a, in_b = (_mean_around(noisy - usual, _SPOT) for noisy in self._means(self._color, rows))
+        energy, theirs = torch.where(a > b, in_a, in_b), torch.where(a > b, in_b, in_a)
         halves = [theirs, *(_mean_around(one, _SPOT) for one in (seen.double() * self._scale).unbind(-1))]
         met = torch.stack([torch.minimum(one, energy) for one in halves]).mean(0)
         inside = energy > _largest_around(energy, _SPOT) / 2  # of a window that misses the path nothing can be told

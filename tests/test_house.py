@@ -17,6 +17,7 @@ ORDER = (
     {"frame", "exr"},
     {"stages", "pooling"},
     {"guard", "fireflies", "independence", "lone_pixels", "metrics"},
+    {"sums"},
     {"correct", "candidates", "history", "aovs"},
     {"aov_channels"},
     {"files", "facts"},

@@ -10,6 +10,10 @@ colours, and the groups.
 `--scene tufts`: blades of grass before nothing, so that alpha is noisy where they and the defocus blur end, around a
 wax ball (subsurface scattering), a copper one and a lamp, with the same two groups.
 
+`--scene shelf`: a closed white corner that a low sun (``key``) enters through slats, with two small coloured lamps and
+a glowing strip (``fill``), a lacquered board, bottles of coloured glass and a rough steel block on it: sharp shadows,
+most light indirect, no world and no fog.
+
 Nothing is loaded; the scene is made by code. The halves are set up by `render_blender.py`, with seeds of their own and
 of the reference's.
 """
@@ -199,7 +203,34 @@ def tufts(view: int = 0) -> bpy.types.Scene:
     return scene
 
 
-SCENES = {"still-life": still_life, "tufts": tufts}
+def shelf(view: int = 0) -> bpy.types.Scene:
+    """Bottles on a lacquered board, in slatted sun and the light of two lamps."""
+    scene = empty()
+    floor = add("plane", material("lacquer", "BsdfPrincipled", Roughness=0.2, **{"Base Color": (0.3, 0.12, 0.06, 1)}),
+                size=4)  # fmt: skip
+    floor.name = "floor"
+    white = material("plaster", "BsdfDiffuse", Color=(0.75, 0.73, 0.7, 1))
+    add("cube", white, size=1, location=(0.0, 1.6, 1.2), scale=(4.0, 0.1, 2.4))
+    add("cube", white, size=1, location=(-2.0, 0.0, 1.2), scale=(0.1, 4.0, 2.4))
+    add("cube", white, size=1, location=(0.0, 0.0, 2.4), scale=(4.0, 4.0, 0.1))
+    for i in range(9):  # the slats, and beside them the open side that the sun comes through
+        add("cube", white, size=1, location=(2.0, -1.8 + 0.4 * i, 1.2), scale=(0.05, 0.22, 2.4))
+    for i, color in enumerate(((0.25, 0.8, 0.35, 1), (0.9, 0.55, 0.15, 1), (0.3, 0.5, 0.95, 1))):
+        glass = material(f"bottle {i}", "BsdfGlass", Color=color, Roughness=0.02, IOR=1.45)
+        add("cylinder", glass, radius=0.18, depth=0.8, location=(-0.9 + 0.7 * i, 0.5 - 0.25 * i, 0.41), vertices=48)
+    steel = material("steel", "BsdfGlossy", Color=(0.7, 0.72, 0.75, 1), Roughness=0.4)
+    add("cube", steel, size=0.5, location=(-1.2, -0.5, 0.25), rotation=(0.0, 0.0, 0.5))
+    add("uv_sphere", checkered("ball"), radius=0.3, location=(1.0, -0.5, 0.3), segments=48, ring_count=24)
+    strip = material("strip", "Emission", Color=(0.5, 0.8, 1.0, 1), Strength=4.0)
+    add("cube", strip, size=1, location=(0.0, 1.5, 1.7), scale=(2.4, 0.05, 0.05)).lightgroup = "fill"
+    lamp("sun", "key", "SUN", 12.0, (6.0, -1.5, 2.4), angle=0.01, color=(1.0, 0.9, 0.75))
+    lamp("left", "fill", "POINT", 15.0, (-1.5, -1.2, 1.6), shadow_soft_size=0.04, color=(1.0, 0.4, 0.3))
+    lamp("right", "fill", "POINT", 10.0, (1.4, 0.9, 1.5), shadow_soft_size=0.04, color=(0.5, 0.7, 1.0))
+    look(scene, (0.2, -3.4, 1.3), (0.0, 0.3, 0.6), lens=30)
+    return scene
+
+
+SCENES = {"still-life": still_life, "tufts": tufts, "shelf": shelf}
 
 
 def main() -> None:

@@ -42,8 +42,8 @@ def correct_files(
     show: Callable[[Frame], None] | None = None,
     gather: pages.Gather | None = None,
 ) -> Written:
-    """Correct one frame from files to file; ``show`` is called with the denoised frame, ``gather`` with it and the
-    result.
+    """Correct one frame from files to file; ``show`` is called with the denoised frame, ``gather`` with that of
+    each view layer and its result.
     """
     layers, told = sources.of_layers(getattr(options, "view_layers", ALL_LAYERS))
     log(*told)
@@ -63,8 +63,6 @@ def correct_files(
             denoised = runner.denoise(loaded, start)
             del loaded
             first = not done
-            done.append(
-                runner.correct(denoised, show=show if first else None, stop=stop, gather=gather if first else None)
-            )
+            done.append(runner.correct(denoised, show=show if first else None, stop=stop, gather=gather))
             del denoised
         return runner.write(output, done[0], done[1:])

@@ -225,7 +225,8 @@ def _of_aovs(pixels: int, count: int, half: float, held: float) -> float:
     image = pixels * _RGB
     kept = 1.25 * image * (count / 3)
     working = 12 * image  # denoised halves and their mean, the guides of each, one AOV's evidence
-    return BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + working
+    moving = 7 * image  # the picture that moves, its halves as given and as they move, and those of the sum
+    return BASE + _WORK + 2 * half + 4 * image + 2 * held + kept + moving + working
 
 
 def rounded(size: float) -> str:

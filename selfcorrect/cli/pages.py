@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -17,7 +18,7 @@ from selfcorrect.report.shot import looked_at
 from selfcorrect.settings import Settings
 from selfcorrect.shot.run import Outcome
 
-__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "facts_of", "images_of", "target", "write"]
+__all__ = ["MAPS", "FramePage", "Gather", "ShotPage", "facts_of", "images_of", "page_of", "target", "write"]
 
 MAPS = ("error.before", "error.after", "blend")
 """Of a result's maps, in the order of the page."""
@@ -33,6 +34,15 @@ def target(path: str | None) -> Path | None:
         FileError: it cannot be written.
     """
     return None if path is None else exr.check_target(path, ".html")
+
+
+def page_of(page: Path, layer: str) -> Path:
+    """Where the page of a further view layer stands: beside the first, with its name in the file's.
+
+    >>> page_of(Path("page.html"), "Far Hills").name
+    'page.Far_Hills.html'
+    """
+    return page.with_name(f"{page.stem}.{re.sub(r'[^A-Za-z0-9_-]', '_', layer)}{page.suffix}")
 
 
 def write(page: Path, text: str) -> None:
@@ -77,12 +87,13 @@ def images_of(frame: Frame, corrected: Any) -> dict[str, tuple[Any, ...]]:
 
 
 class FramePage:
-    """The page of one frame; what is kept for it is small enough to stand beside any frame in memory."""
+    """The pages of one frame, one of each view layer; what is kept for them is small enough to stand beside any frame
+    in memory.
+    """
 
     def __init__(self, page: Path):
         self._page = page
-        self._images: dict[str, Any] = {}
-        self._maps: dict[str, Any] = {}
+        self._layers: list[tuple[dict[str, Any], dict[str, Any]]] = []
 
     @classmethod
     def at(cls, path: str | None) -> "FramePage | None":
@@ -91,14 +102,21 @@ class FramePage:
         return None if page is None else cls(page)
 
     def gather(self, frame: Frame, result: Result) -> None:
-        """Keep what is to be looked at."""
-        self._images = {name: report.shrunk(*parts) for name, parts in images_of(frame, result.image).items()}
-        self._maps = {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}
+        """Keep what is to be looked at; called once for each view layer, in their order."""
+        images = {name: report.shrunk(*parts) for name, parts in images_of(frame, result.image).items()}
+        self._layers.append((images, {name: report.shrunk(result.maps[name]) for name in MAPS if name in result.maps}))
 
     def write(self, facts: Mapping[str, Any]) -> None:
-        """Write the page; ``facts`` are what --json prints."""
+        """Write the pages; ``facts`` are what --json prints."""
         title = Path(facts["output"]).name
-        write(self._page, report.frame_page(self._images, self._maps, {**facts, "title": title}))
+        others: dict[str, Mapping[str, Any]] = facts.get("layers") or {}
+        if others:
+            title = f"{title}::{facts['layer']}"
+        (images, maps), *further = self._layers
+        write(self._page, report.frame_page(images, maps, {**facts, "title": title}))
+        for (images, maps), (layer, own) in zip(further, others.items(), strict=True):
+            about = {**facts, **own, "title": f"{Path(facts['output']).name}::{layer}"}
+            write(page_of(self._page, layer), report.frame_page(images, maps, about))
 
 
 def _summed(given: Iterable[Mapping[str, Any]]) -> dict[str, Any]:

@@ -182,27 +182,36 @@ class Runner:
                 stop=stop,
                 opened=self._stages,
                 extra=denoised.extra,
+                keep_halves=bool(origin.plan.groups),
             )
+        aovs, about, result = self._aovs(origin, frame, result)
         if gather is not None:
             gather(frame, result)
-        aovs, about = self._aovs(origin, frame, result)
         corrected = facts.Corrected.of(known, result, self._options.preset, self.settings, {**(more or {}), **about})
         outputs = _outputs(result, self._options.diagnostics)
         return Corrected(origin, outputs, aovs, result.network, corrected, began, denoised.layer)
 
-    def _aovs(self, origin: files.Origin, frame: Frame, result: Result) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Channels of the AOVs that the user wants corrected, and what is to be told of them."""
+    def _aovs(
+        self, origin: files.Origin, frame: Frame, result: Result
+    ) -> tuple[dict[str, Any], dict[str, Any], Result]:
+        """Channels of the AOVs that the user wants corrected, what is to be told of them, and the result with the
+        picture that they sum to.
+        """
         if not origin.plan.written:
-            return {}, {}
+            return {}, {}, result
         assert self._aovs_denoise is not None  # there would be no plan
         start = time.perf_counter()
         denoise = denoiser_of(frame, self._aovs_denoise)
         a, b = origin.reopened()
         assert b is not None  # there would be no plan
         through = self._options.pass_through
-        found = correct_channels((a, b), origin.plan, result.image, frame, denoise, pass_through=through)
+        halves, result = result.halves, replace(result, halves=None)
+        found = correct_channels(
+            (a, b), origin.plan, result.image, frame, denoise, corrected_halves=halves, pass_through=through
+        )
         log(*found.lines, f"AOVs: {time.perf_counter() - start:.1f} s")
-        return found.planes, {"aovs": found.facts}
+        result = result.with_outputs({COLOR_OUTPUT: frame.like_input(found.picture)})
+        return found.planes, {"aovs": found.facts}, result
 
     def denoise(self, loaded: files.Loaded, began: float | None = None, *, keep_aids: bool = False) -> Denoised:
         """Read what stages need beyond the halves, and denoise where that is to be done.

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.commands import BALANCED, call, refused
 from helpers.exr_files import save, three
+from helpers.pages import data_of, unpacked
 
 from selfcorrect import exr
 from selfcorrect.exr.view_layers import chosen, view_layers
@@ -91,6 +92,17 @@ def test_layers_that_are_not_named_stay_the_mean(halves: list[Path], tmp_path: P
     assert np.array_equal(image(out, "Near.Combined"), mean(halves, "Near.Combined").astype(np.float32))
     assert not np.array_equal(image(out, "Far.Combined"), mean(halves, "Far.Combined").astype(np.float32))
     assert "layers" not in json.loads(result.stdout)
+
+
+def test_each_layer_has_a_page(halves: list[Path], tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    assert call("frame", *halves, "-o", tmp_path / "out.exr", *FEW, "--report", page).returncode == 0
+    first, second = (data_of(path.read_text()) for path in (page, tmp_path / f"page.{LAYERS[1]}.html"))
+    shown = [next(layer for layer in data["layers"] if layer["name"] == "corrected") for data in (first, second)]
+    for layer, name in zip(shown, LAYERS, strict=True):
+        written = image(tmp_path / "out.exr", f"{name}.Combined")
+        np.testing.assert_allclose(np.moveaxis(unpacked(layer), 0, -1), written, rtol=2**-11, atol=1e-6)
+    assert f"out.exr::{LAYERS[1]}" in (tmp_path / f"page.{LAYERS[1]}.html").read_text()
 
 
 def test_diagnostics_are_of_each_layer(halves: list[Path], tmp_path: Path) -> None:
