@@ -204,7 +204,7 @@ class _Search:
         found &= _largest_around(spot, _SPOT) > 0
         share = _mean_around(_largest_around(found, _GROWN), _GROWN)
         if self._seen is not None:
-            often = _largest_around(found * self._often(self._seen[wide], a, b, wide), _SPOT)
+            often = _largest_around(found * self._often(self._seen[wide], a, b, wide), _SPOT + 2 * _GROWN)
             share = share * (1 - 2 * often).clamp(min=0)
         return share[inner]
 
@@ -248,7 +248,8 @@ class _Search:
         halves = [theirs, *(_mean_around(one, _SPOT) for one in (seen.double() * self._scale).unbind(-1))]
         met = torch.stack([torch.minimum(one, energy) for one in halves]).mean(0)
         inside = energy > _largest_around(energy, _SPOT) / 2  # of a window that misses the path nothing can be told
-        return torch.where(inside & (energy > 0), met / energy, 0.0).clamp(0, 1)
+        often: Tensor = torch.where(inside & (energy > 0), met / energy, 0.0).clamp(0, 1)
+        return often
 
     def excess(self, image: Radiance, rows: slice) -> Tensor:
         """What to take off rows of an image, (rows, W, 3) ≥ 0."""
