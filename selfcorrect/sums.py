@@ -8,8 +8,8 @@ error on. So the sum is a candidate of the picture, as in :mod:`selfcorrect.guar
 
 n and d of the guard and s the standard error of n over the tile's own pixels; of tiles of 64, 32, 16 and 8 pixels the
 one that moves furthest. Both directions sum much the same products of noise, so that s is taken for √2 times what
-pixels say that were independent in both. No tile is moved by what the rest of the frame says: over the frame, fireflies in the witness
-hide whether the sum is better, which over most tiles is plain.
+pixels say that were independent in both. No tile is moved by what the rest of the frame says: over the frame, fireflies
+in the witness hide whether the sum is better, which over most tiles is plain.
 
 Measured with `scripts/bench/aovs.py`.
 """
