@@ -1,5 +1,6 @@
 """Another exposure changes nothing else, swapped halves change nothing, and whatever is generated comes out finite."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.synthetic import BALANCED, boxed, corrected, noisy, plain, scene, swapped, twice
-from helpers.tolerances import EXPOSURE, EXPOSURE_BLEND, EXPOSURE_TINY, EXPOSURE_TINY_BLEND, SWAPPED
+from helpers.tolerances import EXPOSURE, EXPOSURE_BLEND, EXPOSURE_OF_TWO, EXPOSURE_TINY, EXPOSURE_TINY_BLEND, SWAPPED
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -52,6 +53,8 @@ def assert_same_but_for(factor: float, frame: Frame, preset: Settings) -> None:
     expected, got = corrected(through(kept), preset), corrected(through(times), preset)
     image = plain(expected.image)
     bound, of_blend = (EXPOSURE_TINY, EXPOSURE_TINY_BLEND) if factor < 1e-20 else (EXPOSURE, EXPOSURE_BLEND)
+    if math.frexp(factor)[0] == 0.5:
+        bound, of_blend = EXPOSURE_OF_TWO, EXPOSURE_OF_TWO
     assert np.abs(plain(got.image) / factor - image).max() < bound * image.mean()
     torch.testing.assert_close(got.maps["blend"], expected.maps["blend"], rtol=0, atol=of_blend)
 

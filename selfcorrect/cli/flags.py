@@ -66,11 +66,7 @@ def add_halves(parser: argparse.ArgumentParser, *, alone: bool = True) -> None:
 
 def add_report(parser: argparse.ArgumentParser) -> None:
     """The flag --report."""
-    parser.add_argument(
-        "--report",
-        metavar="PAGE.html",
-        help="also write a page to look at, for any browser; of a frame's further view layers PAGE.LAYER.html",
-    )
+    parser.add_argument("--report", metavar="PAGE.html", help="also write a page to look at, for any browser")
 
 
 def add_maxmem(parser: argparse.ArgumentParser) -> None:

@@ -11,7 +11,7 @@ from helpers.render_scripts import BLENDER
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 PYTHON = sorted(path for path in SCRIPTS.rglob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
 SHELL = sorted(path for path in SCRIPTS.rglob("*") if path.is_file() and path.read_bytes().startswith(b"#!/bin/sh"))
-IN_BLENDER = {"render_blender.py", "build_shot.py", "ghosts.py", "light_passes.py"}
+IN_BLENDER = {"render_blender.py", "build_shot.py", "ghosts.py", "light_passes.py", "outliers.py"}
 
 TOLD = """
 import contextlib, io, json, pathlib, runpy, sys
