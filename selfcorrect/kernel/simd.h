@@ -45,28 +45,27 @@ inline Float maximum(Float a, Float b) {
 
 inline Float minimum(Float a, Float b) { return -maximum(-a, -b); }
 
-// 2^x for x <= 0; below 2^-126 the result is 0. Relative error 8e-8 (degree-5 minimax on an interval of length 1).
+// 2^x for x <= 0; below 2^-126 the result is 0. Relative error 8e-8 (degree-5 minimax on [0, 1]).
 inline Float exp2_nonpositive(Float x) {
 #if defined(__AVX512F__)
     const Float f = (Float)_mm512_reduce_ps((__m512)x, _MM_FROUND_TO_NEG_INF);  // x - floor(x)
+#else
+    const Float bounded = maximum(x, splat(-127.0f));
+    const Int n = __builtin_convertvector(bounded, Int) - 1;  // truncation, then one below: f in (0, 1]
+    const Float f = bounded - __builtin_convertvector(n, Float);
+#endif
     Float p = splat(0.001877576675985079f);
     p = p * f + 0.008989340088482341f;
     p = p * f + 0.05582631805508341f;
     p = p * f + 0.24015361704373198f;
     p = p * f + 0.693153073200244f;
     p = p * f + 0.9999999250635269f;
+#if defined(__AVX512F__)
     return (Float)_mm512_scalef_ps((__m512)p, (__m512)x);  // p * 2^floor(x)
 #else
-    constexpr float magic = 12582912.0f;  // 1.5 * 2^23: what is added to it is rounded, and left in its lowest bits
-    const Float rounded = maximum(x, splat(-127.0f)) + magic;
-    const Float f = maximum(x, splat(-127.0f)) - (rounded - magic);  // in -1/2 .. 1/2
-    Float p = splat(0.0013276472454890609f);
-    p = p * f + 0.009675540961325169f;
-    p = p * f + 0.05550713092088699f;
-    p = p * f + 0.24022120237350464f;
-    p = p * f + 0.6931469440460205f;
-    p = p * f + 1.0f;
-    return (Float)((Int)p + ((Int)rounded << 23));  // p * 2^rounded: added to the exponent's bits
+    const Int exponent = n + 127;
+    const Float scale = (Float)((exponent > 0 ? exponent : exponent * 0) << 23);
+    return p * scale;
 #endif
 }
 

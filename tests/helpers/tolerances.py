@@ -7,9 +7,9 @@ Measured on an AVX2 processor over the tests' own cases and one to two more seed
 """
 
 # Of a frame's mean: another exposure, all steps of the balanced preset through training and guard. Factors 1e-4 … 1e36.
-# Powers of two change no bit. Others round the frame, and Adam divides a gradient of the rounding's size by its own.
+# Powers of two change no bit.
 EXPOSURE_OF_TWO = 1e-7  # 0
-EXPOSURE = 5e-4  # 1.5e-4 once in twenty, else 6.6e-6
+EXPOSURE = 5e-5  # 6.6e-6
 EXPOSURE_BLEND = 5e-6  # 6.6e-7, the guard's blend from 0 to 1
 # Factors below 1e-20, where float32 keeps few digits of the frame or of its products.
 EXPOSURE_TINY = 1e-3  # 3.4e-4
