@@ -1,6 +1,5 @@
 """From files to file: the halves of one frame in, the corrected frame out."""
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,11 +19,10 @@ from selfcorrect.exr.limits import check_alike
 from selfcorrect.exr.passes import Others, means, picture
 from selfcorrect.exr.view_layers import chosen, view_layers
 from selfcorrect.frame import Frame
-from selfcorrect.image.repair import repaired
+from selfcorrect.renders import color_of, same_file
 from selfcorrect.settings import ALL_LAYERS
 
 __all__ = [
-    "Images",
     "Loaded",
     "Origin",
     "Picture",
@@ -32,9 +30,7 @@ __all__ = [
     "Sources",
     "load",
     "load_all",
-    "load_images",
     "save",
-    "save_combined",
 ]
 
 
@@ -212,7 +208,7 @@ def load(sources: Sources, *, shot: bool = False) -> Loaded:
         pairs["denoised"] = denoised
         taken["denoised"] = half_a.taken.get("denoised", [str(sources.denoised_a)])
     if sources.denoised_full:
-        pairs["denoised_full"] = _color_of(sources.denoised_full, (height, width))
+        pairs["denoised_full"] = color_of(sources.denoised_full, (height, width))
     try:
         frame = Frame(**pairs)
     except FrameError as error:
@@ -338,62 +334,9 @@ def save(
     return Saved(clipped, told._replace(corrected=len(corrected)))
 
 
-@dataclass(frozen=True, eq=False)
-class Images:
-    """Renders of one frame in memory.
-
-    Attributes:
-        images: (H, W, 3) float32 tensors of linear radiance, finite; a reconstructed one may be negative.
-        source: the first one as it was read.
-        lost: a line for each of its attributes that cannot be written back.
-    """
-
-    images: tuple[Tensor, ...]
-    source: exr.HalfFile
-    lost: tuple[str, ...]
-
-
-def load_extra(paths: Sequence[str], size: tuple[int, int]) -> tuple[Tensor, ...]:
-    """The colours of images that a stage needs beyond the halves, of this height and width.
-
-    Raises:
-        FileError: a file cannot be read, or the same file was given twice.
-        FrameError: a size does not fit.
-    """
-    _check_different(paths)
-    return tuple(_color_of(path, size) for path in paths)
-
-
-def load_images(paths: Sequence[str]) -> Images:
-    """Read the colour of several renders of one frame.
-
-    Raises:
-        FileError: a file cannot be read, or the same file was given twice.
-        FrameError: sizes do not fit.
-    """
-    _check_different(paths)
-    check_alike(paths)
-    first = exr.load_half(paths[0])
-    lost = exr.check_source(first.file)
-    size = first.buffers["color"].shape[:2]
-    colors = [first.buffers["color"], *(_color_of(path, size) for path in paths[1:])]
-    images = tuple(repaired(color, path) for color, path in zip(colors, paths, strict=True))
-    return Images(images, first, tuple(lost))
-
-
-def save_combined(path: str, images: Images, image: Tensor, *, details: Mapping[str, Any]) -> int:
-    """Write a combined colour under the names it had in the first render, with all else of that one.
-
-    Returns:
-        how many values lay beyond the range of half floats and were clipped, where the file holds those.
-    """
-    attributes = {"selfcorrect/combine": json.dumps(dict(details))}
-    return exr.write(path, images.source.file, image.cpu().numpy(), images.source.taken["color"], attributes)
-
-
 def _check_distinct(sources: Sources) -> None:
     a, b = (Path(path.partition("::")[0]) for path in (sources.a, sources.b))
-    if sources.a == sources.b or (sources.a.partition("::")[2] == sources.b.partition("::")[2] and _same_file(a, b)):
+    if sources.a == sources.b or (sources.a.partition("::")[2] == sources.b.partition("::")[2] and same_file(a, b)):
         raise FileError(
             f"{sources.b}: expected the other half of the samples, but got the same file twice; identical halves "
             "carry no information: render the second one with another seed"
@@ -403,30 +346,11 @@ def _check_distinct(sources: Sources) -> None:
         raise SettingsError(f"{given}: expected both denoised halves or none, but got one")
 
 
-def _check_different(paths: Sequence[str]) -> None:
-    for i, path in enumerate(paths):
-        if any(path == other or _same_file(Path(path), Path(other)) for other in paths[:i]):
-            raise FileError(f"{path}: expected renders with seeds of their own, but got the same file twice")
-
-
-def _same_file(a: Path, b: Path) -> bool:
-    return a.exists() and b.exists() and os.path.samefile(a, b)
-
-
 def _denoised(sources: Sources, half_a: _Half, half_b: _Half) -> tuple[Any, Any] | None:
     """The denoised halves that the user named, else those that lie beside the halves."""
     size = half_a.buffers["color"].shape[:2]
     if sources.denoised_a and sources.denoised_b:
-        return _color_of(sources.denoised_a, size), _color_of(sources.denoised_b, size)
+        return color_of(sources.denoised_a, size), color_of(sources.denoised_b, size)
     if "denoised" in half_a.buffers and "denoised" in half_b.buffers:
         return half_a.buffers["denoised"], half_b.buffers["denoised"]
     return None
-
-
-def _color_of(path: str, size: tuple[int, ...]) -> Any:
-    color = _half(path).buffers["color"]
-    if color.shape[:2] != size:
-        raise FrameError(
-            f"{path}: expected {size[1]}x{size[0]} pixels like the halves, but got {color.shape[1]}x{color.shape[0]}"
-        )
-    return color

@@ -20,6 +20,7 @@ ORDER = (
     {"sums"},
     {"correct", "candidates", "history", "aovs"},
     {"aov_channels"},
+    {"renders"},
     {"files", "facts"},
     {"shot", "tradeoff", "report"},
     {"cli"},

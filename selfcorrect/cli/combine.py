@@ -3,7 +3,7 @@
 import argparse
 import time
 
-from selfcorrect import exr, files
+from selfcorrect import exr, renders
 from selfcorrect.cli.terminal import answer, log
 from selfcorrect.stages import uncorrelated
 
@@ -14,7 +14,7 @@ def run(options: argparse.Namespace) -> None:
     """Run the command."""
     start = time.perf_counter()
     exr.check_target(options.output)
-    four = files.load_images([*options.independent, *options.correlated])
+    four = renders.load_images([*options.independent, *options.correlated])
     log(*(f"warning: {line}" for line in four.lost))
     image, gamma = uncorrelated.combine(
         four.images[:4],
@@ -24,7 +24,7 @@ def run(options: argparse.Namespace) -> None:
         kernel=options.kernel,
     )
     report = {"kernel": options.kernel, "gamma": gamma, "samples": options.samples, "crossed": options.crossed}
-    clipped = files.save_combined(options.output, four, image, details=report)
+    clipped = renders.save_combined(options.output, four, image, details=report)
     log(f"{options.output}: written after {time.perf_counter() - start:.1f} s (gamma {gamma:g})")
     if clipped:
         log(f"{options.output}: {clipped} values beyond the range of half floats were clipped")

@@ -10,7 +10,7 @@ import torch
 
 import denoisers
 from denoisers import check_threads
-from selfcorrect import facts, files, stages
+from selfcorrect import facts, files, renders, stages
 from selfcorrect.aov_channels import correct_channels
 from selfcorrect.aovs import denoiser_of
 from selfcorrect.candidates import with_candidates
@@ -224,7 +224,7 @@ class Runner:
         began = time.perf_counter() if began is None else began
         frame, channels = loaded.frame, loaded.origin.taken
         extra = {
-            name: _extra(name).of(frame, files.load_extra(paths, frame.size))
+            name: _extra(name).of(frame, renders.load_extra(paths, frame.size))
             for name, paths in self._extra_files.items()
         }
         seconds = {"read": time.perf_counter() - began}
