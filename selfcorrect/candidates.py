@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from selfcorrect.frame import Candidate, Frame, mean, prefiltered
-from selfcorrect.guard import Evidence
+from selfcorrect.guard import CERTAIN, Evidence
 from selfcorrect.image.bands import average, tile_means
 from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Scaled, scale_to_one
@@ -28,7 +28,6 @@ WORTH = 0.01
 
 _SIDE = 128  # of a crop, pixels: a multiple of the guard's largest tile
 _CROPS = (3, 2)  # at most so many by so many
-_CERTAIN = 1.645  # standard errors: the normal distribution leaves 5 % beyond
 
 
 def promises(frame: Frame, denoisers: Mapping[str, Denoiser]) -> dict[str, float]:
@@ -67,7 +66,7 @@ def _most(evidence: Evidence) -> float:
 
     tiles = tile_means(evidence.size[0], errors)
     n, d, error = average(tiles, evidence.size)
-    n += _CERTAIN * float(tiles[0].std()) / math.sqrt(tiles[0].numel())
+    n += CERTAIN * float(tiles[0].std()) / math.sqrt(tiles[0].numel())
     if n <= 0 or d <= 0:
         return 0.0
     alpha = min(n / d, 1.0)

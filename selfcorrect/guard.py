@@ -31,10 +31,10 @@ from selfcorrect.image.channels import channel_mean
 from selfcorrect.image.exposure import Radiance
 from selfcorrect.pooling import pairs, pooled, taken_off
 
-__all__ = ["Estimate", "Evidence", "Guarded", "guard", "keep_light_"]
+__all__ = ["CERTAIN", "Estimate", "Evidence", "Guarded", "guard", "keep_light_"]
 
 _OUTERMOST = 0.005  # share of the tiles at either end that the verdict pulls in
-_CERTAIN = 1.645  # standard errors: the normal distribution leaves 5 % beyond
+CERTAIN = 1.645  # standard errors: the normal distribution leaves 5 % beyond
 _LIGHT_TOLERANCE = 3.0  # standard errors of the noisy mean
 _FOLD = 8  # pixels: half of the smallest tile; wide pixel filters correlate noise over one or two
 _DARKEST = 0.01  # radiance; darker pixels weigh no more
@@ -328,7 +328,7 @@ def _more_than_chance(tiles: Tensor) -> bool:
     ordered = tiles.flatten().sort().values
     cut = int(_OUTERMOST * len(ordered))
     pulled_in = ordered.clamp(float(ordered[cut]), float(ordered[-1 - cut]))
-    return float(pulled_in.mean()) > _CERTAIN * _standard_error(pulled_in)
+    return float(pulled_in.mean()) > CERTAIN * _standard_error(pulled_in)
 
 
 def _standard_error(tiles: Tensor) -> float:

@@ -38,7 +38,7 @@ def test_where_the_sum_is_better_the_picture_follows():
     true = torch.full((*SIZE, 3), 1.0)
     picture = biased(true)
     image, halves, far = moved(picture, true, noisy(true))
-    wrong = 0.08 * ((picture - true) ** 2).mean()  # 0.046 to 0.052: α goes from tile to tile bilinearly
+    wrong = 0.08 * ((picture - true) ** 2).mean()  # 0.062: α goes from tile to tile bilinearly
     assert all(((one - true) ** 2).mean() < wrong for one in (image, *halves))
     assert 0.15 < far < 0.5  # the place, and the tiles that it lies in
 
@@ -134,10 +134,8 @@ def test_a_result_keeps_its_halves_where_they_are_asked_for():
     assert a.shape == b.shape == kept.image.shape
     assert (a >= 0).all()
     assert (b >= 0).all()
-    if kept.estimate.improved:
-        assert not torch.equal(a, frame.denoised[0])
-    else:
-        assert torch.allclose(a, frame.denoised[0], rtol=1e-5, atol=1e-6)
+    assert kept.estimate.improved
+    assert not torch.equal(a, frame.denoised[0])
     assert ((a + b) / 2 - kept.image).abs().mean() < 0.1 * kept.image.mean()
 
 

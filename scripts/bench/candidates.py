@@ -34,7 +34,7 @@ from selfcorrect.image.exposure import Scaled, scale_to_one
 MODES = ("oidn:fast", "oidn:none")
 GRID: tuple[tuple[ModuleType, str, tuple[float, ...]], ...] = (
     (guard_module, "_OUTERMOST", (0.0, 0.005, 0.02)),
-    (guard_module, "_CERTAIN", (1.0, 1.645, 2.326)),
+    (guard_module, "CERTAIN", (1.0, 1.645, 2.326)),
     (pooling_module, "_LARGEST_SPREAD", (0.1, 0.25, 0.5)),
     (pooling_module, "_LEAST_SPREAD", (0.001, 0.01, 0.03)),
     (pooling_module, "_OUTLYING", (2.0, 3.0, 5.0)),

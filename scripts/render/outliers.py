@@ -21,9 +21,9 @@ import bpy
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
-from ghosts import box, material
 from halves import even, seed_of, size
 from render_blender import prepare, render_half
+from rooms import box, material, walled
 
 
 def ball(of: bpy.types.Material, at: tuple[float, float, float], radius: float) -> None:
@@ -41,20 +41,8 @@ def lamp(at: tuple[float, float, float], side: float, watts: float) -> bpy.types
 
 
 def room(sky: float = 0.05) -> None:
-    """Three patterned walls, a floor and a camera; ``sky`` is the world's radiance."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    scene.render.engine = "CYCLES"
-    scene.cycles.sample_clamp_direct = scene.cycles.sample_clamp_indirect = 0.0
-    scene.world = bpy.data.worlds.new("world")
-    if bpy.app.version < (5, 0, 0):
-        scene.world.use_nodes = True
-    scene.world.node_tree.nodes["Background"].inputs[1].default_value = sky
-    wall, floor = material("wall", (0.7, 0.6, 0.5), 1.5), material("floor", (0.3, 0.35, 0.4), 2.5)
-    box(floor, (0, 0, -0.05), (8, 8, 0.1))
-    box(wall, (0, 4, 2), (8, 0.1, 4))
-    box(wall, (-4, 0, 2), (0.1, 8, 4))
-    box(wall, (4, 0, 2), (0.1, 8, 4))
+    """The room and a camera; ``sky`` is the world's radiance."""
+    scene = walled(sky)
     bpy.ops.object.camera_add(location=(0, -5, 1.8), rotation=(math.radians(84), 0, 0))
     bpy.context.object.data.lens = 28
     scene.camera = bpy.context.object

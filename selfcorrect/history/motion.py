@@ -122,7 +122,10 @@ def chained(frames: Sequence[Frame], side: int) -> Tensor | None:
         if frame.motion is None:
             return None
         told = mean(frame.motion)[..., :2] if side < 0 else mean(frame.motion)[..., 2:]
-        offset = told if offset is None else offset + fetched(told, offset.nan_to_num())
+        if offset is None:
+            offset = told
+        else:  # what is unknown is fetched from anywhere: the sum stays NaN there
+            offset = offset + fetched(told, offset.nan_to_num())
     return offset
 
 
@@ -154,7 +157,7 @@ def _fitting(image: Tensor, other: Tensor, flow: Tensor, told: Tensor | None) ->
     if told is None:
         return flow, 0.0
     known = told.isfinite().all(-1)
-    told = told.nan_to_num()
+    told = told.nan_to_num()  # taken only where known
     by_files, by_flow = (_difference(image, other, offset) for offset in (told, flow))
     if not bool(known.any()) or by_files[known].median() > _UNFIT * by_flow[known].median() + _ROUNDING:
         return flow, 0.0

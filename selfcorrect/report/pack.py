@@ -65,6 +65,7 @@ def pack(image: Any, bits: int = _MANTISSA) -> Packed:
 
 
 def _integers(planes: Array, bits: int) -> NDArray[np.int32]:
+    # a page is looked at: what is no number is black there, and the run that wrote the file has counted it
     finite = np.nan_to_num(planes.astype(np.float32), nan=0.0, posinf=_LARGEST, neginf=0.0)
     half = np.clip(finite, 0, _LARGEST).astype(np.float16).view(np.uint16).astype(np.int32)
     dropped = _MANTISSA - bits
@@ -111,6 +112,7 @@ def shrunk(*images: Any, pixels: int = _KEPT_PIXELS) -> Array:
 
 def _band(images: Sequence[Any], factor: int) -> Array:
     plain = [np.asarray(image.detach().cpu() if hasattr(image, "detach") else image) for image in images]
+    # as in _integers(), before NaN can spread to the pixels that are averaged with it
     finite = [np.nan_to_num(np.clip(one.astype(np.float32), 0, _LARGEST)) for one in plain]
     kept: Array = np.clip(reduced(sum(finite) / len(finite), factor), 0, _LARGEST).astype(np.float16)
     return kept
