@@ -122,10 +122,8 @@ def chained(frames: Sequence[Frame], side: int) -> Tensor | None:
         if frame.motion is None:
             return None
         told = mean(frame.motion)[..., :2] if side < 0 else mean(frame.motion)[..., 2:]
-        if offset is None:
-            offset = told
-        else:  # what is unknown is fetched from anywhere: the sum stays NaN there
-            offset = offset + fetched(told, offset.nan_to_num())
+        # what is unknown is fetched from anywhere: the sum stays NaN there
+        offset = told if offset is None else offset + fetched(told, offset.nan_to_num())
     return offset
 
 
