@@ -19,9 +19,9 @@ import bpy
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
+from blender_rooms import box, material, walled
 from halves import even, parse_frames, seed_of, size
 from render_blender import prepare, render_half
-from rooms import box, material, walled
 
 LAST, DIMMED = 12, 7
 NAME = "ghosts"

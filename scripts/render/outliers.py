@@ -21,9 +21,9 @@ import bpy
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
+from blender_rooms import box, material, walled
 from halves import even, seed_of, size
 from render_blender import prepare, render_half
-from rooms import box, material, walled
 
 
 def ball(of: bpy.types.Material, at: tuple[float, float, float], radius: float) -> None:
