@@ -14,6 +14,7 @@ from selfcorrect.errors import DeviceError, FrameError
 from selfcorrect.fireflies import Removed, remove_fireflies_
 from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
+from selfcorrect.history import with_history
 from selfcorrect.image.bands import bands, enlarged_rows
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.independence import dependence
@@ -104,6 +105,7 @@ def correct(
     frame: Frame,
     settings: Settings | None = None,
     *,
+    denoiser: Callable[..., Any] | None = None,
     warm_start: Network | None = None,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
@@ -116,6 +118,8 @@ def correct(
     Args:
         frame: halves with their denoised images, linear radiance.
         settings: by default the default preset.
+        denoiser: what denoised the frame, for the samples that its ``neighbours`` within ``frame_radius`` give;
+            without it they give less, without neighbours it is not asked.
         warm_start: the network of the last frame, to go on from with the settings' ``warm_steps``; it is left as it
             is. Where Eq. 8 does not show it to be the better start, as after a cut, a new one is taken.
         progress: called as ``progress(step, steps, loss)`` for every optimiser step in turn; on a device other than the
@@ -137,6 +141,7 @@ def correct(
         FileError: the weights of a trained stage are not there or do not fit.
         SettingsError: a stage stands where it cannot.
         DeviceError: the device is out of memory.
+        MissingPackageError: the frame has neighbours, and there is no optical flow.
 
     Warns:
         MissingKernelsWarning: once in a process, on a CPU without the compiled kernels: about 30 times as long.
@@ -144,6 +149,7 @@ def correct(
     if frame.color[0].device.type == "cpu":
         warn_if_missing()
     settings = settings or Settings.preset(Settings.default())
+    frame = _remembering(frame, settings, denoiser)
     given, *more = frame.candidates
     if opened is None:
         opened = stages.opened(settings)
@@ -185,6 +191,15 @@ def correct(
         shares=dict(zip([*(c.name for c in more), "stages"], guarded.shares, strict=True)) if guarded else {},
         halves=judge.halves if judge is not None else None,
     )
+
+
+def _remembering(frame: Frame, settings: Settings, denoiser: Callable[..., Any] | None) -> Frame:
+    """The frame with what its neighbours know of it, which optical flow finds on the CPU."""
+    if not (frame.neighbours and settings.guard and settings.frame_radius):
+        return frame
+    around = {distance: neighbour.to("cpu") for distance, neighbour in frame.neighbours.items()}
+    remembered, _ = with_history(frame.to("cpu"), around, denoiser, radius=settings.frame_radius)
+    return remembered.to(frame.color[0].device)
 
 
 def _through(

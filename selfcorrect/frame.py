@@ -81,6 +81,8 @@ class Frame:
         more: further images of the frame that the guard may blend in, finite and ≥ 0.
         motion: 4 channels (:data:`selfcorrect.buffers.MOTION`), for the history of a shot's frames; what is NaN or
             infinite is unknown and stays so.
+        neighbours: the frames around it in a shot, by distance in frames (−1 is the one before), whose samples
+            :func:`selfcorrect.correct` lets the guard take; :func:`selfcorrect.correct_sequence` finds them itself.
 
     Attributes:
         aids: what the denoiser was given beside the colours of both halves together, of half a and of half b, where
@@ -89,8 +91,8 @@ class Frame:
             pixel's surface, by the mean of the channels; None without neighbours.
 
     Raises:
-        FrameError: sizes or channel counts do not fit, or a channel of radiance is NaN or infinite at more than half
-            of its pixels.
+        FrameError: sizes or channel counts do not fit, a channel of radiance is NaN or infinite at more than half of
+            its pixels, or a neighbour is no other frame.
     """
 
     color: Pair
@@ -102,6 +104,7 @@ class Frame:
     denoised_full: Any = None
     more: tuple[Candidate, ...] = ()
     motion: Pair | None = None
+    neighbours: "Mapping[int, Frame]" = field(default_factory=dict)
     repairs: dict[str, Repairs] = field(init=False, default_factory=dict)
     constant: list[str] = field(init=False, default_factory=list)
     aids: "Aids | None" = field(init=False, default=None)
@@ -128,6 +131,10 @@ class Frame:
                         f"expected the candidate {candidate.name} of shape {(*self.size, 3)}, "
                         f"but got {tuple(image.shape)}"
                     )
+        for distance, neighbour in self.neighbours.items():
+            if not distance or not isinstance(neighbour, Frame):
+                got = f"{type(neighbour).__name__} at {distance}"
+                raise FrameError(f"expected neighbours as frames by their distance, such as -1 and 1, but got {got}")
 
     def _set(self, buffer: Buffer, arrays: tuple[Any, ...]) -> None:
         """Check, repair and store the pair of one buffer."""
@@ -174,7 +181,7 @@ class Frame:
         return Candidate("denoised", self.denoised, full), *self.more
 
     def denoise(self, denoiser: Callable[..., Any], *, full: bool = True, keep_aids: bool = False) -> "Frame":
-        """This frame with each half denoised on its own, with its own G-buffers.
+        """This frame with each half denoised on its own, with its own G-buffers; and its neighbours alike.
 
         Args:
             denoiser: called as ``denoiser(color, albedo=…, normal=…)`` with (H, W, 3) tensors, first of the mean;
@@ -185,11 +192,15 @@ class Frame:
             keep_aids: keep what the denoiser was given beside the colours, for more to be denoised alike; a dual
                 denoiser leaves nothing to keep.
         """
+        around = {
+            n: frame if frame.denoised is not None else frame.denoise(denoiser, full=full, keep_aids=keep_aids)
+            for n, frame in self.neighbours.items()
+        }
         if getattr(denoiser, "dual", False):
             features = {buffer.name: getattr(self, buffer.name) for buffer in FEATURES}
             pair = cast(DualDenoiser, denoiser).pair(self.color, **features)
-            return self.with_denoised(pair, mean(pair) if full else None)
-        source = self.with_aids(denoiser) if keep_aids else self
+            return self.with_denoised(pair, mean(pair) if full else None)._with_neighbours(around)
+        source = (self.with_aids(denoiser) if keep_aids else self)._with_neighbours(around)
 
         def one(part: int, color: Tensor) -> Any:
             return denoiser(color, **(source.aids[part] if source.aids else source._aids(denoiser, part)))
@@ -234,8 +245,13 @@ class Frame:
         object.__setattr__(frame, "seen", seen)
         return frame
 
+    def _with_neighbours(self, neighbours: "Mapping[int, Frame]") -> "Frame":
+        frame = self._copy()
+        object.__setattr__(frame, "neighbours", neighbours)
+        return frame
+
     def to(self, device: str | torch.device) -> "Frame":
-        """This frame with all its tensors on ``device``."""
+        """This frame with all its tensors on ``device``; its neighbours stay where they are."""
         frame = self._copy()
         if self.seen is not None:
             object.__setattr__(frame, "seen", self.seen.to(device))

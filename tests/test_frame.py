@@ -164,6 +164,12 @@ def test_g_buffers_of_half_floats_are_kept_and_their_mean_is_not_rounded() -> No
     assert not torch.equal(expected.half().double(), expected)
 
 
+@pytest.mark.parametrize("neighbours", [{0: Frame(color=pair((4, 4, 3)))}, {-1: pair((4, 4, 3))}])
+def test_neighbours_are_frames_at_a_distance(neighbours: Any) -> None:
+    with pytest.raises(FrameError, match="^expected neighbours as frames by their distance, such as -1 and 1, but got"):
+        Frame(color=pair((4, 4, 3)), neighbours=neighbours)
+
+
 def test_a_buffer_that_says_nothing_is_left_out() -> None:
     """The network has no input for it, the kernel no term."""
     generator = torch.Generator().manual_seed(0)

@@ -1,6 +1,7 @@
 """What tempts a temporal denoiser to ghost: behind the guard, no frame gets worse than its denoised image."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -167,6 +168,19 @@ def test_it_is_told_whose_the_gain_is() -> None:
     assert sum(shares.values()) == pytest.approx(1)
     assert shares["history"] > 0.8
     assert list(correct(frame(still, HERE), SETTINGS).shares) == ["stages"]
+
+
+def test_one_frame_with_its_neighbours_is_what_a_shot_makes_of_it() -> None:
+    """The history of `Frame.neighbours`, denoised with the frame; what the settings turn off is not looked for."""
+    around = {n - HERE: replace(frame(still, n), denoised=None, denoised_full=None) for n in range(5)}
+    alone = around.pop(0)
+    given = replace(alone, neighbours=around).denoise(demodulated)
+    remembered, _ = Histories(2, demodulated).of(HERE, {n: frame(still, n) for n in range(5)})
+    result = correct(given, replace(SETTINGS, frame_radius=2), denoiser=demodulated)
+    assert torch.equal(result.image, correct(remembered, SETTINGS).image)
+    assert list(result.shares) == ["history", "stages"]
+    for off in (replace(SETTINGS, frame_radius=0), replace(SETTINGS, frame_radius=2, guard=False)):
+        assert torch.equal(correct(given, off, denoiser=demodulated).image, correct(frame(still, HERE), off).image)
 
 
 def test_frames_in_the_wrong_order_do_no_harm() -> None:
