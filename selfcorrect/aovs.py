@@ -334,6 +334,6 @@ def _reconcile_(parts: Sequence[_Part], target: Tensor) -> tuple[float, float]:
     return (math.sqrt(before / level), math.sqrt(after / level)) if level > 0 else (0.0, 0.0)
 
 
-def _features(frame: Frame) -> dict[str, Pair]:
+def _features(frame: Frame) -> dict[str, Any]:
     pairs = {buffer.name: getattr(frame, buffer.name) for buffer in FEATURES}
     return {name: pair for name, pair in pairs.items() if pair is not None}

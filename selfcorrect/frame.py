@@ -132,9 +132,7 @@ class Frame:
                         f"but got {tuple(image.shape)}"
                     )
         for distance, neighbour in self.neighbours.items():
-            if not distance or not isinstance(neighbour, Frame):
-                got = f"{type(neighbour).__name__} at {distance}"
-                raise FrameError(f"expected neighbours as frames by their distance, such as -1 and 1, but got {got}")
+            _check_neighbour(distance, neighbour)
 
     def _set(self, buffer: Buffer, arrays: tuple[Any, ...]) -> None:
         """Check, repair and store the pair of one buffer."""
@@ -281,6 +279,12 @@ class Frame:
             return _at_most(image, limit).to(self._like.device, self._like.dtype)
         limit = float(np.finfo(self._like.dtype).max)
         return _at_most(image, limit).cpu().numpy().astype(self._like.dtype, copy=False)
+
+
+def _check_neighbour(distance: int, neighbour: object) -> None:
+    if not distance or not isinstance(neighbour, Frame):
+        got = f"{type(neighbour).__name__} at {distance}"
+        raise FrameError(f"expected neighbours as frames by their distance, such as -1 and 1, but got {got}")
 
 
 def mean(pair: Pair) -> Tensor:

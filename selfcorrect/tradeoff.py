@@ -201,7 +201,8 @@ def warm_up(frame: Frame) -> None:
     """Correct a corner of a frame, for nothing: the first call of a process is slower than those to be timed."""
     buffers = {name: getattr(frame, name) for name in Half._fields}
     side = _WARM_UP_SIDE
-    corner = Frame(**{n: (p[0][:side, :side], p[1][:side, :side]) for n, p in buffers.items() if p is not None})
+    cut: dict[str, Any] = {n: (p[0][:side, :side], p[1][:side, :side]) for n, p in buffers.items() if p is not None}
+    corner = Frame(**cut)
     for name, settings in Settings.presets().items():
         short = {"steps": 1} if settings.steps else {"epochs": 1}
         correct(corner, Settings.preset(name, **short))

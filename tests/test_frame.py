@@ -166,7 +166,10 @@ def test_g_buffers_of_half_floats_are_kept_and_their_mean_is_not_rounded() -> No
 
 @pytest.mark.parametrize("neighbours", [{0: Frame(color=pair((4, 4, 3)))}, {-1: pair((4, 4, 3))}])
 def test_neighbours_are_frames_at_a_distance(neighbours: Any) -> None:
-    with pytest.raises(FrameError, match="^expected neighbours as frames by their distance, such as -1 and 1, but got"):
+    with pytest.raises(
+        FrameError,
+        match=r"^expected neighbours as frames by their distance, such as -1 and 1, but got (Frame at 0|tuple at -1)$",
+    ):
         Frame(color=pair((4, 4, 3)), neighbours=neighbours)
 
 

@@ -6,10 +6,11 @@
 Frames are the packaged one, mirrored until it fills the size: both halves alike, so that they stay independent. Every
 run is a process of its own, whose peak memory is what the system says at its end. For each size: OIDN alone (the full
 buffer with albedo and normal), then for each preset the real command `selfcorrect frame` from files to file; what it
-takes on top of denoising and correction (imports, EXR in and out) is its overhead. Presets that count epochs, like
-`paper`, would take hours: they are marked ~ and end after --sample of their steps; the seconds of training are those of
-a step, the first left out, times the number of all steps, plus what the start took. They are denoised by `box`, since
-who denoised makes no difference to the seconds; their memory is that of the correction, without OIDN's.
+takes on top of denoising (further candidates' too) and correction is its overhead: imports, EXR in and out. Presets
+that count epochs, like `paper`, would take hours: they are marked ~ and end after --sample of their steps; the seconds
+of training are those of a step, the first left out, times the number of all steps, plus what the start took. They are
+denoised by `box`, since who denoised makes no difference to the seconds; their memory is that of the correction,
+without OIDN's.
 """
 
 import argparse
@@ -37,10 +38,17 @@ from selfcorrect.stages.core.patches import steps_count
 Size = tuple[int, int]  # width, height
 
 
+COLUMNS = (
+    *("size", "run", "denoise", "candidates", "train", "infer", "correction"),
+    *("of OIDN's time", "of paper's", "overhead", "peak GiB"),
+)
+
+
 class Cost(NamedTuple):
     """Seconds and memory of one run; NaN where a stage is not part of it."""
 
     denoise: float
+    candidates: float
     train: float
     infer: float
     overhead: float
@@ -59,11 +67,7 @@ def main() -> None:
         return
     sampled = ", ".join(name for name in options.preset if not Settings.preset(name).steps) or "none"
     print(f"{options.threads} thread(s); sampled ({options.sample} steps, scaled to all): {sampled}")
-    print(
-        "| size | run | denoise | train | infer | correction | of OIDN's time | of paper's | overhead | peak GiB |\n"
-        "|---|---|---|---|---|---|---|---|---|---|",
-        flush=True,
-    )
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
     costs: dict[str, dict[Size, Cost]] = {}
     for size in options.sizes:
         with tempfile.TemporaryDirectory(dir=options.folder) as folder:
@@ -107,14 +111,14 @@ def of_size(options: argparse.Namespace, size: Size, folder: str, costs: dict[st
     oidn = run([*script, "oidn"])
     rows: dict[str, Cost | None] = {"OIDN": None}
     if oidn is not None:
-        rows["OIDN"] = Cost(oidn["seconds"], math.nan, math.nan, math.nan, oidn["gibibytes"])
+        rows["OIDN"] = Cost(oidn["seconds"], *[math.nan] * 4, oidn["gibibytes"])
     # the sampled ones first, so that the others' ratio to paper can be told at once
     for preset in sorted(options.preset, key=lambda name: Settings.preset(name).steps):
         if Settings.preset(preset).steps:
             rows[preset] = command(options, folder, preset)
         else:
             found = run([*script, "sample", "--preset", preset])
-            rows[preset] = found and Cost(math.nan, found["train"], found["infer"], math.nan, found["gibibytes"])
+            rows[preset] = found and Cost(*[math.nan] * 2, found["train"], found["infer"], math.nan, found["gibibytes"])
     for name, cost in rows.items():
         told = f"| {size[0]}x{size[1]} | {'' if name == 'OIDN' or Settings.preset(name).steps else '~'}{name} |"
         if cost is None:
@@ -123,7 +127,7 @@ def of_size(options: argparse.Namespace, size: Size, folder: str, costs: dict[st
         costs.setdefault(name, {})[size] = cost
         yardsticks = (rows["OIDN"] and rows["OIDN"].denoise, rows.get("paper") and rows["paper"].correction)
         ratios = [cost.correction / y if y else math.nan for y in yardsticks]
-        numbers = [cost.denoise, cost.train, cost.infer, cost.correction]
+        numbers = [cost.denoise, cost.candidates, cost.train, cost.infer, cost.correction]
         cells = [*map(seconds, numbers), *(plain(r) for r in ratios), seconds(cost.overhead), plain(cost.gibibytes)]
         print(f"{told} {' | '.join(cells)} |", flush=True)
 
@@ -166,9 +170,10 @@ def command(options: argparse.Namespace, folder: str, preset: str) -> Cost | Non
     if found is None:
         return None
     Path(f"{folder}/{preset}.exr").unlink()
-    denoise, train, infer, guard = (found["seconds"].get(name, 0.0) for name in ("denoise", "train", "infer", "guard"))
-    infer += guard
-    return Cost(denoise, train, infer, found["wall"] - denoise - train - infer, found["gibibytes"])
+    names = ("denoise", "candidates", "train", "infer", "guard")
+    denoise, candidates, train, infer, guard = (found["seconds"].get(name, 0.0) for name in names)
+    overhead = found["wall"] - denoise - candidates - train - infer - guard
+    return Cost(denoise, candidates, train, infer + guard, overhead, found["gibibytes"])
 
 
 def make_frame(options: argparse.Namespace) -> dict[str, Any]:
