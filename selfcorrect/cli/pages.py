@@ -2,11 +2,11 @@
 
 import contextlib
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from selfcorrect import exr, report
 from selfcorrect.correct import Result
@@ -37,12 +37,12 @@ def target(path: str | None) -> Path | None:
 
 
 def page_of(page: Path, layer: str) -> Path:
-    """Where the page of a further view layer stands: beside the first, with its name in the file's.
+    """Where the page of a further view layer stands: beside the first, with its name in the file's, no two alike.
 
-    >>> page_of(Path("page.html"), "Far Hills").name
-    'page.Far_Hills.html'
+    >>> page_of(Path("page.html"), "Far Hills").name, page_of(Path("page.html"), "Far/Hills").name
+    ('page.Far Hills.html', 'page.Far%2FHills.html')
     """
-    return page.with_name(f"{page.stem}.{re.sub(r'[^A-Za-z0-9_-]', '_', layer)}{page.suffix}")
+    return page.with_name(f"{page.stem}.{quote(layer, safe=' ')}{page.suffix}")
 
 
 def write(page: Path, text: str) -> None:
