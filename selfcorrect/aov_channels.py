@@ -1,5 +1,6 @@
 """The AOVs of a frame's files, corrected, as channels to write: what was planned, one set after the other."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -47,7 +48,7 @@ def correct_channels(
     """Correct the AOVs that were planned.
 
     Args:
-        halves: the files of both.
+        halves: the files of both; they give up the pixels of AOVs, one after the other.
         plan: what to correct (:func:`selfcorrect.exr.aovs.plan`).
         image: the corrected picture, (H, W, 3) linear radiance, NumPy or torch.
         frame: the denoised frame that it was made of.
@@ -58,7 +59,8 @@ def correct_channels(
     Raises:
         FrameError: an AOV is of another size than the frame, or hardly finite.
     """
-    through = _Through(halves, frame, denoise, pass_through=pass_through)
+    once = _read_once(plan.groups)
+    through = _Through(halves, frame, denoise, once, pass_through=pass_through)
     own = _apart(plan.groups)
     first = correct_sums(image, frame, [through.sum_of(g, g.aovs) for g in own], denoise, corrected_halves)
     made = {group.name: corrected for group, corrected in zip(own, first, strict=True)}
@@ -73,7 +75,7 @@ def correct_channels(
             images = corrected.images
             del corrected
         else:
-            pairs = Halves(*halves, group.aovs)
+            pairs = Halves(*halves, group.aovs, once)
             images = {name: correct_alone(frame, name, pairs[name], denoise) for name in pairs}
         done |= {name: image for name, image in images.items() if name in later}
         for aov in group.aovs:
@@ -89,8 +91,17 @@ def correct_channels(
 class _Through:
     """What the sums of a frame's files have in common."""
 
-    def __init__(self, halves: tuple[ExrFile, ExrFile], frame: Frame, denoise: Denoise, *, pass_through: bool):
+    def __init__(
+        self,
+        halves: tuple[ExrFile, ExrFile],
+        frame: Frame,
+        denoise: Denoise,
+        once: frozenset[str],
+        *,
+        pass_through: bool,
+    ):
         self._halves, self._frame, self._denoise, self._pass_through = halves, frame, denoise, pass_through
+        self._once = once
 
     def sum_of(self, group: Group, aovs: Sequence[Aov]) -> AovSum:
         """AOVs of a group, with the colours that they will be divided by."""
@@ -99,7 +110,7 @@ class _Through:
             for aov in aovs
             if aov.color is not None
         }
-        return AovSum(group.name, Halves(*self._halves, aovs), group.remainder, colors)
+        return AovSum(group.name, Halves(*self._halves, aovs, self._once), group.remainder, colors)
 
     def rest(self, group: Group, picture: Tensor, done: dict[str, Tensor]) -> Corrected:
         """The AOVs of a group but those that an earlier one has made sum, which stay."""
@@ -109,6 +120,13 @@ class _Through:
         for name in shared:
             left = left - done[name]
         return correct_aovs(left.clamp(min=0), self._frame, self.sum_of(group, own), self._denoise)
+
+
+def _read_once(groups: Sequence[Group]) -> frozenset[str]:
+    """Channels that one AOV of one set has to itself: nothing else will read them."""
+    aovs = [aov for group in groups for aov in group.aovs]
+    counts = Counter(channel for aov in aovs for channel in (*aov.channels, *(aov.color or ())))
+    return frozenset(channel for aov in aovs for channel in aov.channels if counts[channel] == 1)
 
 
 def _apart(groups: Sequence[Group]) -> list[Group]:

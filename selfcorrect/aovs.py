@@ -116,8 +116,8 @@ def denoiser_of(frame: Frame, denoiser: Callable[..., Any]) -> Denoise:
     aids = tuple(frame.aids_for(denoiser))
 
     def each(color: Pair) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        images = [denoiser(image, **beside) for image, beside in zip((mean(color), *color), aids, strict=True)]
-        full, a, b = (image.clamp(min=0) for image in images)
+        given = zip((mean(color), *color), aids, strict=True)
+        full, a, b = (denoiser(image, **beside).clamp(min=0) for image, beside in given)
         return (a, b), full
 
     return each

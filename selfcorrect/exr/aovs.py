@@ -1,6 +1,6 @@
 """Which AOVs of a frame's files are corrected, together with which others: found by name, proven by their pixels."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,13 +70,25 @@ class Plan:
 
 
 class Halves(Mapping[str, tuple[Pixels, Pixels]]):
-    """The noisy halves of AOVs by name, (H, W, 3) float32 each, made when they are asked for."""
+    """The noisy halves of AOVs by name, (H, W, 3) float32 each, made when they are asked for.
 
-    def __init__(self, a: ExrFile, b: ExrFile, aovs: Sequence[Aov]):
-        self._files, self._aovs = (a, b), {aov.name: aov for aov in aovs}
+    Args:
+        a: half a.
+        b: half b.
+        aovs: what there is.
+        once: channels whose pixels the files give up as soon as they have been asked for.
+    """
+
+    def __init__(self, a: ExrFile, b: ExrFile, aovs: Sequence[Aov], once: Container[str] = ()):
+        self._files, self._aovs, self._once = (a, b), {aov.name: aov for aov in aovs}, once
 
     def __getitem__(self, name: str) -> tuple[Pixels, Pixels]:
-        first, second = (radiance(file, self._aovs[name]).astype(np.float32) for file in self._files)
+        aov = self._aovs[name]
+        first, second = (radiance(file, aov).astype(np.float32) for file in self._files)
+        for channel in aov.channels:
+            if channel in self._once:
+                for file in self._files:
+                    file.give_up(channel)
         return first, second
 
     def __iter__(self) -> Iterator[str]:

@@ -61,7 +61,7 @@ class Part:
     name: str
     header: Mapping[str, Any]
     attributes: Mapping[str, Attribute]
-    channels: Mapping[str, Pixels]
+    channels: dict[str, Pixels]
     linear: frozenset[str]
     data_window: Window
     display_window: Window
@@ -125,6 +125,12 @@ class ExrFile:
         """Pixels of a channel by its full name, (height, width), in the type of the file."""
         index, channel = self.place(name)
         return self.parts[index].channels[channel]
+
+    def give_up(self, name: str) -> None:
+        """Free the memory of a channel that nobody will read again; its type can still be asked for."""
+        index, channel = self.place(name)
+        held = self.parts[index].channels
+        held[channel] = np.empty((0, 0), held[channel].dtype)
 
 
 def float_type(file: ExrFile, name: str) -> np.dtype[Any]:

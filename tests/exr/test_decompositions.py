@@ -212,3 +212,18 @@ def test_light_is_divided_by_the_colour_that_is_written(tmp_path, dtype):
         product = written[f"L.DiffDir.{letter}"].astype(np.float64) * color.astype(dtype)
         assert np.all(abs(product - wanted[..., index]) <= np.finfo(dtype).eps * wanted[..., index])
     assert radiance(a, aov).shape == (*SIZE, 3)
+
+
+def test_files_give_up_what_is_read_once(tmp_path):
+    """The pixels, not what else is known of the channel; colours and what others read stay."""
+    a, b, names = both(tmp_path, "L.Combined", [(["L.DiffDir", "L.DiffInd"], "L.DiffCol"), "L.Emit"], np.float16)
+    (group,) = plan(a, b, names, "auto").groups
+    diffuse, emission = group.aovs[0], next(aov for aov in group.aovs if aov.channels == tuple(three("L.Emit")))
+    before = Halves(a, b, group.aovs)[diffuse.name], Halves(a, b, group.aovs)[emission.name]
+    frugal = Halves(a, b, group.aovs, once=frozenset(emission.channels))
+    for aov, pair in zip((diffuse, emission), before, strict=True):
+        assert all(np.array_equal(x, y) for x, y in zip(frugal[aov.name], pair, strict=True))
+    for file in (a, b):
+        assert {file.pixels(name).size for name in emission.channels} == {0}
+        assert {file.pixels(name).shape for name in (*diffuse.channels, *diffuse.color)} == {SIZE}
+    assert set(planes_of(a, b, emission, before[1][0])) == set(emission.channels)
