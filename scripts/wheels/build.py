@@ -36,11 +36,15 @@ TARGETS = {
     "windows-x86_64": Target("x86_64-windows-gnu", "Windows", "AMD64", "win_amd64"),
     "macos-arm64": Target("aarch64-macos.11.0", "Darwin", "arm64", "macosx_11_0_arm64"),
 }
-# nanobind hands Apple's linker a file of the names that Python brings at run time; Zig's own takes no such file.
+# nanobind hands Apple's linker a file of the names that Python brings at run time; Zig's own takes no such file. It
+# also crashes where it is asked for a bundle: Python loads a library as well.
 OWN_LINKER = """
 for argument do
     shift
-    case "$argument" in -Wl,@*) argument=-Wl,-undefined,dynamic_lookup ;; esac
+    case "$argument" in
+        -Wl,@*) argument=-Wl,-undefined,dynamic_lookup ;;
+        -bundle) argument=-dynamiclib ;;
+    esac
     set -- "$@" "$argument"
 done
 """

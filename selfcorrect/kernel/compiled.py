@@ -3,6 +3,7 @@
 import warnings
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from selfcorrect.errors import MissingKernelsWarning
@@ -11,6 +12,9 @@ if TYPE_CHECKING:
     from selfcorrect.kernel import _cpu as functions
 
 __all__ = ["functions", "installed", "missing", "warn_if_missing"]
+
+
+_FOLDER = Path(__file__).parents[2]
 
 
 class _Missing:
@@ -46,8 +50,11 @@ def missing() -> str:
     """
     if installed():
         return ""
+    elsewhere = ""
+    if (_FOLDER / "pyproject.toml").is_file():  # Python started there takes it, whatever is installed
+        elsewhere = f"Python reads the sources in {_FOLDER}: start it elsewhere if selfcorrect is installed; else "
     return (
-        f"the compiled kernels are not installed ({_reason}), and plain torch is about 30 times slower; "
+        f"the compiled kernels are not installed ({_reason}), and plain torch is about 30 times slower; {elsewhere}"
         "install the wheel for this machine, or a C++ compiler (g++ or clang++) and run in the folder of selfcorrect: "
         "pip install --force-reinstall --no-deps ."
     )

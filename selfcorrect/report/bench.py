@@ -65,7 +65,7 @@ def _table(points: Sequence[Mapping[str, Any]], told: Sequence[Mapping[str, Any]
     for one, plain in sorted(zip(points, told, strict=True), key=lambda pair: pair[1]["seconds"]):
         marks = [word for word in ("front", "preset", "recommended") if plain[word]]
         deviation = f"{one['ratio']:.3f} ± {one['standard_error']:.3f}"
-        seconds = [f"{value:.2f}" for value in (one["train"], one["infer"], plain["seconds"])]
-        rows.append((one["point"], *seconds, deviation, ", ".join(marks)))
-    head = ("point", "train, s", "infer, s", "seconds", "error over denoised", "")
+        seconds, *parts = (f"{value:.2f}" for value in (plain["seconds"], one["train"], one["infer"]))
+        rows.append((one["point"], deviation, seconds, ", ".join(marks), *parts))
+    head = ("point", "error over denoised", "seconds", "", "train", "infer")
     return table("Estimated without a reference; the quickest first", head, rows, "numbers points")

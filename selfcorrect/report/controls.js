@@ -43,10 +43,10 @@ class Viewer {
     const remark = [...root.children];
     root.append(
       make("div", { class: "bar" }, this.tabs),
-      make("div", { class: "bar" }, this.modes, this.besideGroup, this.exposure.group,
+      make("div", { class: "bar tools" }, this.modes, this.besideGroup, this.exposure.group,
         make("div", { class: "group" }, make("span", { class: "name" }, "Tone mapping"), curves),
         make("div", { class: "group" }, make("span", { class: "name" }, "Zoom"), ...zooms.map(([text, label, act]) => make("button", { type: "button", "aria-label": label, title: label, onclick: act }, text)), this.zoomOutput)),
-      this.stages, this.legend, ...remark, hint, this.inspector,
+      make("div", { class: "look" }, make("div", { class: "seen" }, this.stages, this.legend), this.inspector), ...remark, hint,
     );
     document.addEventListener("keydown", (event) => this.key(event));
     new ResizeObserver(() => this.draw()).observe(this.stages);

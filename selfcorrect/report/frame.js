@@ -9,9 +9,13 @@ if (regions.length > 1) {
   document.getElementById("viewer").prepend(make("div", { class: "bar" }, group));
 }
 
+let wanted; // the region asked for last: one that takes longer to unpack must not come in its place
 async function open(region) {
+  wanted = region;
   region.unpacked ??= layersOf(region.layers);
-  viewer.load(await region.unpacked, region.scale, [region.left, region.top]);
+  const layers = await region.unpacked;
+  if (region !== wanted) return;
+  viewer.load(layers, region.scale, [region.left, region.top]);
   buttons.forEach((button, i) => button.setAttribute("aria-pressed", regions[i] === region));
 }
 

@@ -8,7 +8,7 @@ let chosen = points.find((p) => p.recommended) ?? points[0];
 let budget = most;
 
 const logs = (share) => least * (most / least) ** share;
-const seconds = (s) => `${s < 10 ? s.toFixed(2) : s.toFixed(0)} s`;
+const seconds = (s) => `${s.toFixed(s < 10 ? 2 : s < 100 ? 1 : 0)} s`;
 const told = make("p", { class: "told", role: "status" });
 const plot = make("div");
 

@@ -11,10 +11,14 @@ const toned = []; // pictures outside the viewer, shown with its exposure
 
 const gainOf = (frame) => (frame.change === null ? frame.outcome : frame.change < 0 ? percent(frame.change) : "kept");
 
+let wanted; // the frame asked for last: one that takes longer to unpack must not come in its place
 function select(frame) {
+  wanted = frame;
   for (const [number, button] of buttons) button.setAttribute("aria-pressed", number === frame.number);
   if (!cache.has(frame.number)) cache.set(frame.number, layersOf(frame.layers));
-  return cache.get(frame.number).then((layers) => viewer.load(layers, frame.scale));
+  return cache.get(frame.number).then((layers) => {
+    if (frame === wanted) viewer.load(layers, frame.scale);
+  });
 }
 
 async function drawStrip() {
@@ -45,7 +49,7 @@ function gainChart() {
     const known = data.frames.filter((frame) => frame.change !== null);
     const most = Math.max(0.05, ...known.map((frame) => -frame.change + (frame.error ?? 0)));
     const y = (gain) => top + (1 - gain / most) * (height - top - bottom);
-    const step = (width - left) / data.frames.length, every = Math.ceil(data.frames.length / ((width - left) / 44));
+    const step = Math.min(128, (width - left) / data.frames.length), every = Math.ceil(data.frames.length / ((width - left) / 44));
     const svg = make("svg:svg", { height, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `Gain of each frame, from ${known.map((f) => `${f.number}: ${gainOf(f)}`).join(", ")}` });
     for (const gain of [0, most / 2, most]) {
       svg.append(make("svg:line", { class: "axis", x1: left, x2: width, y1: y(gain), y2: y(gain) }), make("svg:text", { class: "quiet", x: left - 6, y: y(gain) + 4, "text-anchor": "end" }, gain ? percent(-gain, most < 0.2 ? 1 : 0) : "0"));

@@ -110,17 +110,19 @@ def test_page_of_bench(halves: Halves, tmp_path: Path) -> None:
 
 
 class TestBadInput:
-    @pytest.mark.parametrize("command", ["frame", "bench", "report"])
+    @pytest.mark.parametrize("command", ["frame", "sequence", "bench", "report"])
     @pytest.mark.parametrize("page", ["none/page.html", "page.png", "."])
     def test_where_the_page_cannot_be(self, halves: Halves, tmp_path: Path, command: str, page: str) -> None:
+        out = tmp_path / "out.exr"
         more = {
-            "frame": ["-o", tmp_path / "out.exr", *BALANCED, "--report"],
+            "frame": ["-o", out, *BALANCED, "--report"],
+            "sequence": ["-o", tmp_path / "out.####.exr", "--frames", "1-2", *BALANCED, "--report"],
             "bench": ["--points", "fast", *BALANCED, "--report"],
-            "report": [tmp_path / "out.exr", "-o"],
+            "report": [out, "-o"],
         }
         line = refused(command, *halves, *more[command], tmp_path / page)
         assert str(tmp_path / page) in line
-        assert not (tmp_path / "out.exr").exists()
+        assert not list(tmp_path.glob("out*.exr"))
 
     def test_other_sizes(self, halves: Halves, out: Path, tmp_path: Path) -> None:
         other, page = write_half(tmp_path / "small.exr", 3, size=(24, 29)), tmp_path / "page.html"

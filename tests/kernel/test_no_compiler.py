@@ -76,6 +76,7 @@ def test_the_command_tells_once(tmp_path: Path) -> None:
         assert len(told) == (name == "torch"), result.stderr
     assert told[0].startswith("warning: ")
     assert "pip install --force-reinstall --no-deps ." in told[0]
+    assert f"Python reads the sources in {Path(__file__).parents[2]}: start it elsewhere" in told[0]
     one, other = (load_half(Path(path)).buffers["color"] for path in outputs)
     assert float(abs(one - other).max()) < 2e-3 * float(one.mean())  # half floats
 

@@ -74,6 +74,11 @@ def frame_page() -> str:
     return report.frame_page(images(), maps(), FACTS)
 
 
+def of_frame(number: int) -> dict[str, Any]:
+    """Another frame's images: the more light, the later."""
+    return {name: (image * number).astype(np.float16) for name, image in images().items()}
+
+
 def shot_page() -> str:
     facts = {"estimate": ESTIMATE, "size": {"width": SIZE[1], "height": SIZE[0]}, "start": {"warm": True}}
     frames = [
@@ -81,7 +86,7 @@ def shot_page() -> str:
             number,
             "written",
             facts,
-            images=images(),
+            images=of_frame(number),
             maps=maps(),
             thumbnail=report.thumbnail(images()["corrected"]),
             rows={name: report.slice_of(image) for name, image in images().items()},
@@ -247,6 +252,57 @@ def test_what_was_changed_most_in_every_pixel(opened: Any) -> None:
     driver.find_element(By.CSS_SELECTOR, "[data-layer=corrected]").click()
     np.testing.assert_array_equal(pixel(driver, 10, 10, (320, 320)), [255, 255, 255])
     np.testing.assert_array_equal(pixel(driver, 200, 100, (320, 320)), shown(large["corrected"][100, 520]))
+
+
+def test_a_frame_with_nan_opens(opened: Any) -> None:
+    broken = images()
+    broken["noisy"][2, 3:6] = np.nan
+    broken["corrected"][3, 4] = np.inf
+    driver = opened(report.frame_page(broken, maps(), FACTS))
+    for key, name, expected in (("1", "noisy", 0), ("3", "corrected", 255)):
+        press(driver, key)
+        y, x = (int(at[0]) for at in np.nonzero(~np.isfinite(broken[name].sum(-1))))
+        np.testing.assert_array_equal(pixel(driver, x, y), [expected] * 3)
+    assert "NaN or infinite" in driver.find_element(By.TAG_NAME, "body").text
+
+
+class TestWhereThingsStand:
+    """What is looked at together is seen together."""
+
+    def box(self, driver: Any, selector: str) -> Any:
+        return driver.find_element(By.CSS_SELECTOR, selector).rect
+
+    def test_numbers_beside_the_image_where_there_is_room(self, opened: Any) -> None:
+        driver = opened(frame_page(), 1600)
+        stage, numbers = self.box(driver, ".stage"), self.box(driver, ".inspector")
+        assert stage["x"] + stage["width"] <= numbers["x"]
+        assert stage["y"] <= numbers["y"] <= stage["y"] + 0.1 * stage["height"]
+        press(driver, "g")
+        assert self.box(driver, ".inspector")["y"] > self.box(driver, ".stage")["y"]
+        assert self.box(driver, ".inspector")["x"] < 100
+
+    def test_the_image_before_the_tools_where_there_is_none(self, opened: Any) -> None:
+        driver = opened(frame_page(), 400)
+        stage, tools, numbers = (self.box(driver, name) for name in (".stage", ".tools", ".inspector"))
+        assert stage["y"] + stage["height"] <= tools["y"] <= numbers["y"]
+        assert stage["y"] < 700
+
+    def test_the_errors_of_bench_are_seen_without_scrolling(self, opened: Any) -> None:
+        driver = opened(bench_page(), 400)
+        for column in (1, 2, 3):
+            cell = self.box(driver, f".points tbody tr :nth-child({column})")
+            assert cell["x"] + cell["width"] <= 400
+
+
+def test_the_frame_asked_for_last_is_shown(opened: Any) -> None:
+    """Though another one, which had to be unpacked first, was asked for a moment before."""
+    driver = opened(shot_page())
+    driver.execute_async_script(
+        "const done = arguments[0], buttons = document.querySelectorAll('.frames button');"
+        "buttons[1].click(); buttons[0].click(); setTimeout(done, 500)"
+    )
+    press(driver, "3")
+    np.testing.assert_array_equal(pixel(driver, 4, 3), shown(of_frame(1)["corrected"][3, 4]))
 
 
 def test_a_frame_of_a_shot_is_chosen(opened: Any) -> None:

@@ -83,18 +83,14 @@ class Operator:
         for name in ("invoke", "modal", "_begin", "_end", "_failed", "_clean", "_status"):
             setattr(self, name, types.MethodType(real[name], self))
         self.animation, self.reports, self.timers = False, [], 0
-        self.status, self.popups = [], []
+        self.status, self.kinds = [], []
 
     def report(self, kind, message):
         self.reports.append(message)
+        self.kinds += kind
 
     def status_text_set(self, text):
         self.status.append(text)
-
-    def popup_menu(self, draw, title, icon):
-        recorder = Recorder()
-        draw(types.SimpleNamespace(layout=recorder), None)
-        self.popups.append([title, icon, *recorder.texts])
 
     def event_timer_add(self, interval, window):
         self.timers += 1
@@ -114,7 +110,6 @@ def in_the_event_loop(cancel=""):
         event_timer_add=operator.event_timer_add,
         event_timer_remove=operator.event_timer_remove,
         modal_handler_add=lambda operator: None,
-        popup_menu=operator.popup_menu,
         windows=[],
     )
     context = types.SimpleNamespace(
@@ -141,7 +136,7 @@ def in_the_event_loop(cancel=""):
         "timers": operator.timers,
         "drawn": seen[0],
         "status": operator.status,
-        "popups": operator.popups,
+        "kinds": operator.kinds,
     }
 
 

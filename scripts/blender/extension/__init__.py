@@ -2,7 +2,6 @@
 
 import shutil
 import tempfile
-import textwrap
 import time
 from pathlib import Path
 
@@ -90,16 +89,6 @@ class SelfcorrectSettings(bpy.types.PropertyGroup):
     )
 
 
-def popup(message):
-    """What a pop-up draws: a long message in lines that fit."""
-
-    def draw(menu, context):
-        for line in textwrap.wrap(message, 90):
-            menu.layout.label(text=line)
-
-    return draw
-
-
 def preferences(context):
     return context.preferences.addons[__package__].preferences
 
@@ -153,16 +142,11 @@ class SELFCORRECT_OT_render(bpy.types.Operator):
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
         try:
-            result = self._end(context)
+            return self._end(context)
         except work.WorkError as error:
-            result = self._failed(str(error))
+            return self._failed(str(error))
         finally:
             self._clean()
-        if (
-            result == {"CANCELLED"} and State.message != CANCELLED
-        ):  # what a modal operator reports at its end is only written to the status bar
-            context.window_manager.popup_menu(popup(State.message), title="selfcorrect", icon="ERROR")
-        return result
 
     def _status(self, context):
         """Progress in the status bar and in the panel."""
@@ -199,7 +183,8 @@ class SELFCORRECT_OT_render(bpy.types.Operator):
 
     def _failed(self, message):
         State.message = message
-        self.report({"ERROR"}, message)
+        # Blender shows an error as a pop-up; who has cancelled knows
+        self.report({"INFO"} if message == CANCELLED else {"ERROR"}, message)
         return {"CANCELLED"}
 
     def _clean(self):

@@ -18,7 +18,7 @@ inline void gather_taps(const Taps<Present>& taps, const Float* factor, Float ce
             Float distance[term_count], exponent;
             for_each_term<Present>([&](auto m) {
                 const auto difference = taps.template centre_of<m.value>() - taps.template guide<m.value>(p);
-                if constexpr (taps.raised(m.value)) d[m.value] = difference;
+                if constexpr (Taps<Present>::raised(m.value)) d[m.value] = difference;
                 if constexpr (terms[m.value].logarithmic)
                     distance[m.value] = log2_above_one(dot(difference, difference, splat(1.0f)));
                 else
@@ -32,7 +32,7 @@ inline void gather_taps(const Taps<Present>& taps, const Float* factor, Float ce
             if (dx == 0 && dy == 0) w = centre_weight;
             w_sum += w;
             for_each_term<Present>([&](auto m) {
-                if constexpr (taps.raised(m.value)) accumulate(sum[m.value], w, d[m.value]);
+                if constexpr (Taps<Present>::raised(m.value)) accumulate(sum[m.value], w, d[m.value]);
             });
             if constexpr (Keep) {
                 store(kept, w);

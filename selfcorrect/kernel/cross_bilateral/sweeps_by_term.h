@@ -61,7 +61,7 @@ inline void add_up(const TapRow<Present>& row, Float& w_sum, Three* sums) {
         const Float w = load(row.tap(i));
         if constexpr (Weights) total += w;
         for_each_term<Present & Some>([&](auto m) {
-            if constexpr (taps.raised(m.value))
+            if constexpr (Taps<Present>::raised(m.value))
                 accumulate(sum[m.value], w,
                            taps.template centre_of<m.value>() - taps.template guide<m.value>(row.pixel(i)));
         });
