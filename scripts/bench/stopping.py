@@ -10,9 +10,10 @@ a target. Every --look steps Eq. 8 of the blocks is compared, block by block, wi
 
 Prints for each frame and look the error of the corrected image over that of the denoised one, and the gain on the
 blocks, since the start and since the look before, with standard errors, in per cent of Eq. 8 of the start (most of
-which is noise); beside it the preset as it is. Then for each WORTH: the steps that a rule takes which stops as soon as
-a look gained less than that share of all so far, and the error over that of all steps and over that of the preset; and
-for each scene the same with what is best for the others: fewest steps at no more than 1 % of error.
+which is noise); beside it the preset as it is. Then the steps and the error over that of all steps and over that of
+the preset: of as many steps for every frame; of each of RULES, which stop after so many looks that each gained less
+than a share of all so far; and for each scene of the rule that is best for the others, fewest steps at no more than
+1 % of error over all steps.
 """
 
 import argparse
@@ -44,7 +45,7 @@ BLOCK = 16  # side of what is held out, pixels: that of the guard's tiles
 WARM_UP = 20  # steps, as in training
 AVERAGED = 3.0  # about one over the share of the steps so far that the mean of the weights is of, less one
 OUTERMOST = 0.02  # share of the blocks at either end that are pulled in: fireflies
-WORTH = (-1.0, 0.0, 0.02, 0.05, 0.1, 0.2, 0.5)
+RULES = [(worth, looks) for looks in (1, 2, 3) for worth in (0.0, 0.02, 0.05, 0.1, 0.2)]
 LOST = 1.01  # of error, at most
 
 
@@ -207,10 +208,13 @@ def gain(before: Tensor, after: Tensor) -> Gain:
     return Gain(float(each.mean()), float(each.std()) / math.sqrt(len(each)))
 
 
-def stopped(losses: Sequence[Tensor], worth: float) -> int:
-    """The look at which training ends: the first that gained less than this share of all that was gained so far."""
+def stopped(losses: Sequence[Tensor], worth: float, looks: int) -> int:
+    """The look at which training ends: so many one after another gained less than this share of all gained so far."""
+    low = 0
     for k in range(1, len(losses)):
-        if gain(losses[k - 1], losses[k]).mean < worth * abs(gain(losses[0], losses[k]).mean):
+        enough = gain(losses[k - 1], losses[k]).mean >= worth * abs(gain(losses[0], losses[k]).mean)
+        low = 0 if enough else low + 1
+        if low == looks:
             return k
     return len(losses) - 1
 
@@ -280,35 +284,49 @@ def told(found: Measured, spp: int, seed: int, seconds: dict[str, float]) -> Non
 
 
 def summary(rows: Sequence[Measured]) -> None:
-    """Print what a rule saves and costs, and the same with a constant from the other scenes."""
-    print(
-        "\n| worth | steps, mean | error over all steps | worst | over the preset | worst |\n|---|---|---|---|---|---|"
-    )
-    for worth in WORTH:
-        print(f"| {worth:g} | {' | '.join(score(rows, worth))} |")
+    """Print what stopping saves and costs, and the same with a rule chosen on the other scenes."""
+    print("\n| | steps, mean | error over all steps | worst | over the preset | worst |\n|---|---|---|---|---|---|")
+    for k, steps in enumerate(rows[0].looks):
+        print(f"| {steps} steps | {score(rows, [min(k, len(row.looks) - 1) for row in rows])} |")
+    for worth, looks in RULES:
+        print(f"| {looks} below {worth:g} of the gain | {score(rows, ends(rows, (worth, looks)))} |")
     fewest = [next(k for k, ratio in enumerate(r.ratios) if ratio <= LOST * r.ratios[-1]) for r in rows]
-    steps = [row.looks[k] for row, k in zip(rows, fewest, strict=True)]
-    print(f"fewest steps within {LOST - 1:.0%} of all, by the reference: {steps}, mean {np.mean(steps):.0f}")
+    print(f"| fewest within {LOST - 1:.0%} of all, by the reference | {score(rows, fewest)} |")
     scenes = list(dict.fromkeys(row.scene for row in rows))
-    for scene in scenes if len(scenes) > 1 else []:
-        others = [row for row in rows if row.scene != scene]
-        good = [worth for worth in WORTH if outcome(others, worth)[1] <= LOST] or [WORTH[0]]
-        chosen = min(good, key=lambda worth: outcome(others, worth)[0])
-        print(f"without {scene}: {chosen:g}, there {' | '.join(score([r for r in rows if r.scene == scene], chosen))}")
+    if len(scenes) > 1:
+        by_others(rows, scenes)
 
 
-def outcome(rows: Sequence[Measured], worth: float) -> tuple[float, float, float, float, float]:
+def by_others(rows: Sequence[Measured], scenes: Sequence[str]) -> None:
+    """Print what each scene gets by the rule that is best for the others, and all together."""
+    ordered, chosen = list[Measured](), list[int]()
+    for scene in scenes:
+        own, others = ([row for row in rows if (row.scene == scene) == same] for same in (True, False))
+        good = [rule for rule in RULES if outcome(others, ends(others, rule))[1] <= LOST]
+        never = 0.0, len(own[0].looks)
+        rule = min(good, key=lambda rule, others=others: outcome(others, ends(others, rule))[0], default=never)
+        print(f"| {scene}, by the others {rule[1]} below {rule[0]:g} | {score(own, ends(own, rule))} |")
+        ordered += own
+        chosen += ends(own, rule)
+    print(f"| each by the others' rule | {score(ordered, chosen)} |")
+
+
+def ends(rows: Sequence[Measured], rule: tuple[float, int]) -> list[int]:
+    """The look at which each frame's training ends."""
+    return [stopped(row.losses, *rule) for row in rows]
+
+
+def outcome(rows: Sequence[Measured], looks: Sequence[int]) -> tuple[float, float, float, float, float]:
     """Mean steps; geometric mean and largest of the error over that of all steps, and over that of the preset."""
-    ends = [stopped(row.losses, worth) for row in rows]
-    steps = float(np.mean([row.looks[k] for row, k in zip(rows, ends, strict=True)]))
-    logs = np.log([[r.ratios[k] / r.ratios[-1], r.ratios[k] / r.preset] for r, k in zip(rows, ends, strict=True)])
+    steps = float(np.mean([row.looks[k] for row, k in zip(rows, looks, strict=True)]))
+    logs = np.log([[r.ratios[k] / r.ratios[-1], r.ratios[k] / r.preset] for r, k in zip(rows, looks, strict=True)])
     (full, preset), (worst, beside) = np.exp(logs.mean(0)), np.exp(logs.max(0))
     return steps, float(full), float(worst), float(preset), float(beside)
 
 
-def score(rows: Sequence[Measured], worth: float) -> list[str]:
-    steps, *errors = outcome(rows, worth)
-    return [f"{steps:.0f}", *(f"{error:.3f}" for error in errors)]
+def score(rows: Sequence[Measured], looks: Sequence[int]) -> str:
+    steps, *errors = outcome(rows, looks)
+    return " | ".join([f"{steps:.0f}", *(f"{error:.3f}" for error in errors)])
 
 
 if __name__ == "__main__":
