@@ -26,7 +26,7 @@ def make_view(seed: int, side: int, *, clean: bool) -> dataset.View:
     color = truth * (0.5 + 0.5 * noise)
     images = dataset.inputs_of(color)
     denoised = {name: _denoised(name, images, albedo, normal) for name in DENOISERS}
-    smooth, reference = (truth, torch.stack([truth, truth])) if clean else (color[4], None)
+    smooth, reference = (truth, torch.stack([truth, truth])) if clean else (color[4].clone(), None)
     return dataset.View("", "stripes", 16, color, albedo, normal, 1.0 + y / side, denoised, smooth, reference)
 
 
