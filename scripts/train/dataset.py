@@ -1,8 +1,9 @@
 """The training set's files: one view of a scene each, a safetensors file with its facts as metadata.
 
 A view has five independent renders. Four are the sub-images of a frame, half a of the first two and half b of the
-others; the fifth is an independent image more: a noisy target is as good as a clean one under a squared error
-(Lehtinen et al. 2018), as long as no input shares its samples.
+others; the fifth is the target, of more samples. A noisy target is as good as a clean one under a squared error
+(Lehtinen et al. 2018) as long as no input shares its samples, but where its noise is tens of times what a network could
+gain, thousands of views are needed to see the gain at all.
 """
 
 import hashlib
@@ -30,13 +31,13 @@ class View(NamedTuple):
         name: of the file.
         scene: that it shows.
         spp: samples per pixel of the frame, of both halves together; a sub-image has a quarter of them.
-        color: (5, H, W, 3): four sub-images and one more.
+        color: (5, H, W, 3): four sub-images and the target.
         albedo: 0…1.
         normal: of the surface, length 0 where nothing was hit.
         depth: (H, W), distance; 0 where nothing was hit.
         denoised: by denoiser, (7, H, W, 3): of sub-images 0…3, of halves a and b, and of the frame.
+        smooth: the target denoised; in the validation part the mean of the references, for the weight of the metric.
         reference: (2, H, W, 3), two independent ones; None in the training part.
-        smooth: their mean, denoised, for the weight of the metric; None in the training part.
     """
 
     name: str
@@ -47,12 +48,12 @@ class View(NamedTuple):
     normal: Tensor
     depth: Tensor
     denoised: dict[str, Tensor]
+    smooth: Tensor
     reference: Tensor | None = None
-    smooth: Tensor | None = None
 
 
 def inputs_of(color: Tensor) -> Tensor:
-    """What is denoised of a view's renders (5, H, W, 3): sub-images 0…3, halves a and b, the frame: (7, H, W, 3)."""
+    """What is denoised of a view's sub-images (4 or more, H, W, 3): they, halves a and b, the frame: (7, H, W, 3)."""
     halves = torch.stack([color[:2].mean(0), color[2:SUB_IMAGES].mean(0)])
     return torch.cat([color[:SUB_IMAGES], halves, halves.mean(0, keepdim=True)])
 
@@ -61,9 +62,10 @@ def save(path: Path, view: View, facts: Mapping[str, str]) -> None:
     """Write a view, under a temporary name first; what is denoised and the G-buffers as half floats."""
     half = {"albedo": view.albedo, "normal": view.normal, "depth": view.depth}
     half |= {_PREFIX + name: image for name, image in view.denoised.items()}
-    tensors = {"color": view.color} | {name: t.clamp(-_LARGEST, _LARGEST).half() for name, t in half.items()}
-    if view.reference is not None and view.smooth is not None:
-        tensors |= {"reference": view.reference, "smooth": view.smooth}
+    tensors = {"color": view.color, "smooth": view.smooth}
+    tensors |= {name: t.clamp(-_LARGEST, _LARGEST).half() for name, t in half.items()}
+    if view.reference is not None:
+        tensors["reference"] = view.reference
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     save_file(
         {name: tensor.contiguous() for name, tensor in tensors.items()},
@@ -86,8 +88,8 @@ def load(path: Path) -> View:
         int(facts["spp"]),
         *(tensors[name] for name in ("color", "albedo", "normal", "depth")),
         denoised,
+        tensors["smooth"],
         tensors.get("reference"),
-        tensors.get("smooth"),
     )
 
 

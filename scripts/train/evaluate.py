@@ -104,7 +104,6 @@ def cases(options: argparse.Namespace) -> Iterator[Case]:
 def of_view(view: dataset.View) -> Case:
     """A view as a frame with sub-images, denoised by OIDN."""
     assert view.reference is not None  # a view for validation has references
-    assert view.smooth is not None
     inputs, images = dataset.inputs_of(view.color), view.denoised["oidn"]
     frame = Frame(
         color=(inputs[4], inputs[5]),

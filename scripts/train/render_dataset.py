@@ -1,17 +1,19 @@
-"""Render the training set: views of 128×128 pixels of real and procedural scenes, with five independent renders each.
+"""Render the training set: views of 128×128 pixels of real and procedural scenes, four sub-images and a target each.
 
     python scripts/train/render_dataset.py SCENES -o dataset --views 1000
     python scripts/train/render_dataset.py SCENES -o dataset --views 1000 --workers 8 --minutes 60
 
 SCENES is a folder with one folder per scene and a scene.xml in each; procedural rooms (`rooms.py`) are added. Cameras,
-materials, textures and lights are drawn anew for every view, and samples per pixel between 8 and 128. What a view
-shows depends on the seed and its number alone: an interrupted run goes on where it was, several run side by side.
+materials, textures and lights are drawn anew for every view, samples per pixel between 4 and 128, and which two
+denoisers beside accurate OIDN denoise it. The target is a render of its own, of ``--target-spp``: its noise must be
+less than what a network could gain, or the gain can't be seen in the loss. What a view shows depends on the seed and
+its number alone: an interrupted run goes on where it was, several run side by side.
 
 `validation/` has views with two clean references each: from cameras that no training view comes near, in scenes with
 their own materials, and in rooms that no training view shows. The scenes' own cameras are kept out of both.
 
 Needs the extra `render` and an LLVM library that renders, see `render_mitsuba.py`. Without one, `scalar_rgb` renders
-more slowly, and views that would have had common random numbers are denoised by `joint-bilateral` instead.
+more slowly, and no view is shown with common random numbers.
 """
 
 import argparse
@@ -33,7 +35,7 @@ import drjit
 import mitsuba as mi
 import numpy as np
 import torch
-from dataset import View, inputs_of, metadata_of, save, views
+from dataset import SUB_IMAGES, View, inputs_of, metadata_of, save, views
 from render_mitsuba import CRN, load_scene
 from rooms import room
 from scene import still_life
@@ -43,9 +45,12 @@ from variation import Camera, Variation, original_camera, random_camera, sensor
 import denoisers
 
 SIZE = 128
-SPP = (8, 16, 24, 32, 48, 64, 96, 128)  # of a frame
-PASSES = (64, 8, 2)  # samples of a pass: each number is compiled once for every scene, for 10 s
-EXTRA = {"joint-bilateral": 0.35, "nlm": 0.35, "nfor": 0.2, CRN: 0.1}  # beside oidn, one of them
+SPP = (4, 8, 16, 24, 32, 48, 64, 96, 128)  # of a frame
+PASSES = (64, 8, 1)  # samples of a pass: each number is compiled once for every scene, for 10 s
+ACCURATE = "oidn"  # every view has it
+EXTRA = {"oidn:none": 0.15, "oidn:fast": 0.15, "joint-bilateral": 0.25, "nlm": 0.15, "nfor": 0.15, CRN: 0.15}
+"""Beside it, so many of them, and how likely each is drawn first."""
+EXTRAS = 2
 ROOMS, VALIDATION_ROOMS = range(10), range(1000, 1002)
 STILL_LIFE = "still-life"
 VALIDATION_VIEWS = 2  # per scene
@@ -64,6 +69,7 @@ class Job(NamedTuple):
     scenes: Path
     output: Path
     seed: int
+    target_spp: int
     reference_spp: int
     size: int
     variant: str  # of Mitsuba
@@ -75,8 +81,9 @@ class Shot(NamedTuple):
     number: int
     scene: str
     camera: Camera
-    spp: int
-    denoiser: str  # beside oidn
+    spp: int  # of the frame
+    target_spp: int
+    extra: tuple[str, ...]  # denoisers beside accurate OIDN
 
 
 class Loaded(NamedTuple):
@@ -186,41 +193,42 @@ def training_view(job: Job, name: str, number: int) -> tuple[View, dict[str, str
     place.variation.draw(rng)
     camera = _chosen_camera(job, place, reserved, rng)
     spp = int(rng.choice(SPP))
-    extra = str(rng.choice(list(EXTRA), p=list(EXTRA.values())))
-    if extra == CRN and job.variant != LLVM:
-        extra = "joint-bilateral"
-    return _view(job, place, Shot(number, name, camera, spp, extra), rng)
+    drawn = rng.choice(list(EXTRA), EXTRAS, replace=False, p=list(EXTRA.values())).tolist()
+    extra = tuple(spec for spec in drawn if spec != CRN or job.variant == LLVM)
+    return _view(job, place, Shot(number, name, camera, spp, job.target_spp, extra), rng)
 
 
 def _denoised(
     name: str, noisy: torch.Tensor, albedo: torch.Tensor, normal: torch.Tensor, depth: torch.Tensor
 ) -> torch.Tensor:
-    """Every image of :func:`dataset.inputs_of` denoised; in pairs where the denoiser wants both halves."""
+    """Images (N, H, W, 3) denoised; in pairs where the denoiser wants both halves."""
     denoise = _denoiser(name)
     if not denoise.dual:
-        return torch.stack([denoise(image, albedo=albedo, normal=normal) for image in noisy])
+        clean = dict(zip(("albedo", "normal"), denoise.prefilter(albedo, normal), strict=True))
+        return torch.stack([denoise(image, **clean, prefiltered=True) for image in noisy])
     features = {"albedo": (albedo,) * 2, "normal": (normal,) * 2, "depth": (depth[..., None],) * 2}
     images = [z for i in (0, 2, 4) for z in denoise.pair((noisy[i], noisy[i + 1]), **features)]
     return torch.stack([*images, (images[4] + images[5]) / 2])
 
 
 def _view(job: Job, place: Loaded, shot: Shot, rng: np.random.Generator) -> tuple[View, dict[str, str]]:
-    images = torch.stack([rendered(place, job.size, shot.spp // 4, _seed(rng)) for _ in range(5)])
-    color, buffers = images[..., :3].contiguous(), images[:4, ..., 3:].mean(0)
-    albedo, normal, depth = (buffers[..., part].contiguous() for part in (slice(3), slice(3, 6), 6))
+    samples = [shot.spp // SUB_IMAGES] * SUB_IMAGES + [shot.target_spp]
+    images = torch.stack([rendered(place, job.size, spp, _seed(rng)) for spp in samples])
+    color, buffers = images[..., :3].contiguous(), images[:SUB_IMAGES, ..., 3:].mean(0)
+    features = tuple(buffers[..., part].contiguous() for part in (slice(3), slice(3, 6), 6))
     noisy = inputs_of(color)
-    denoised = {"oidn": _denoised("oidn", noisy, albedo, normal, depth)}
-    if shot.denoiser == CRN:
+    denoised = {name: _denoised(name, noisy, *features) for name in (ACCURATE, *shot.extra) if name != CRN}
+    smooth = _denoised(ACCURATE, color[SUB_IMAGES:], *features)[0]
+    if CRN in shot.extra:
         Variation.place(_sensor(job.size, CRN), shot.camera, place.up)
-        common = torch.stack([rendered(place, job.size, shot.spp // 4, _seed(rng), CRN) for _ in range(4)])[..., :3]
-        denoised["crn"] = inputs_of(torch.cat([common, common[:1]]))
-    else:
-        denoised[shot.denoiser] = _denoised(shot.denoiser, noisy, albedo, normal, depth)
-    view = View(f"{shot.number:07d}", shot.scene, shot.spp, color, albedo, normal, depth, denoised)
+        common = [rendered(place, job.size, shot.spp // SUB_IMAGES, _seed(rng), CRN) for _ in range(SUB_IMAGES)]
+        denoised["crn"] = inputs_of(torch.stack(common)[..., :3])
+    view = View(f"{shot.number:07d}", shot.scene, shot.spp, color, *features, denoised, smooth)
     facts = {
         "seed": job.seed,
         "number": shot.number,
         "camera": shot.camera,
+        "target_spp": shot.target_spp,
         "renderer": f"Mitsuba {mi.__version__}, {job.variant}",
     }
     return view, {name: str(value) for name, value in facts.items()}
@@ -235,9 +243,10 @@ def validation_view(job: Job, name: str, number: int) -> tuple[View, dict[str, s
     place.variation.restore()
     Variation.place(_sensor(job.size, "independent"), camera, place.up)
     spp = (16, 64)[which % 2]
-    view, facts = _view(job, place, Shot(number, name, camera, spp, "joint-bilateral"), rng)
+    extra = ("joint-bilateral", "nfor", "oidn:none")
+    view, facts = _view(job, place, Shot(number, name, camera, spp, spp // SUB_IMAGES, extra), rng)
     pair = torch.stack([rendered(place, job.size, job.reference_spp, _seed(rng)) for _ in range(2)])[..., :3]
-    smooth = _denoiser("oidn")(pair.mean(0), albedo=view.albedo, normal=view.normal)
+    smooth = _denoised(ACCURATE, pair.mean(0, keepdim=True), view.albedo, view.normal, view.depth)[0]
     view = exposed(view._replace(reference=pair.contiguous(), smooth=smooth))
     return view, facts | {"reference_spp": str(job.reference_spp)}
 
@@ -245,7 +254,6 @@ def validation_view(job: Job, name: str, number: int) -> tuple[View, dict[str, s
 def exposed(view: View) -> View:
     """A validation view brought to a mean of 1: the 0.01 of the metric would hide the errors of dark ones."""
     assert view.reference is not None  # they have them
-    assert view.smooth is not None
     scale = 1 / float(view.smooth.mean().clamp(min=1e-6))
     return view._replace(
         color=view.color * scale,
@@ -288,6 +296,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DATASET")
     parser.add_argument("--views", type=int, default=1000, help="of the training part (default: %(default)s)")
     parser.add_argument("--validation", type=int, help="validation views (default: two of each scene)")
+    parser.add_argument(
+        "--target-spp", type=int, default=256, help="of a training view's target (default: %(default)s)"
+    )
     parser.add_argument("--reference-spp", type=int, default=256, help="of each reference (default: %(default)s)")
     parser.add_argument("--size", type=int, default=SIZE, help="pixels (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
@@ -308,7 +319,8 @@ def main() -> int:
     except VariantError as error:
         print(f"render_dataset: error: {error}", file=sys.stderr)
         return 2
-    job = Job(options.scenes.resolve(), options.output, options.seed, options.reference_spp, options.size, variant)
+    spp = options.target_spp, options.reference_spp
+    job = Job(options.scenes.resolve(), options.output, options.seed, *spp, options.size, variant)
     all_validation = VALIDATION_VIEWS * len(validation_names(job.scenes))
     validation = all_validation if options.validation is None else min(all_validation, options.validation)
     wanted = {VALIDATION: validation, "train": options.views}

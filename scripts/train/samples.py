@@ -1,14 +1,15 @@
 """What a network learns from: random inputs and targets out of a view, as planes (…, H, W).
 
 A noisy target is as good as a clean one under a squared error (Lehtinen et al. 2018) where its noise is independent of
-all else in the loss. So of a view's five renders some are the input, alone or as means, the target is the mean of those
-left, and the weight of the loss comes from the denoised image of the *inputs*: one of the target would weigh a pixel
+all else in the loss. So of a view's sub-images some are the input, alone or as means, the target is a render of its
+own, and the weight of the loss comes from the denoised image of the *inputs*: one of the target would weigh a pixel
 that came out bright by chance less, and teach the network to darken.
 
-Path-traced noise has tails that a few thousand steps cannot average: of some views the relative squared noise is 20,
-and nearly all of it in a few pixels. Leaving those to a bound of the gradient's norm teaches to darken, too: by 12 % in
-the median of the validation views after 400 steps. So what such pixels have too much is spread over their surroundings
-(:func:`spread`): light is neither lost nor gained, only where in those 31×31 pixels it lies remains unknown.
+Path-traced noise has tails that a few thousand steps cannot average, and of a target of 256 samples, too, nearly all
+noise may lie in a few pixels. Leaving those to a bound of the gradient's norm teaches to darken: by 12 % in the median
+of the validation views after 400 steps. So what such pixels have beyond the denoised *target* is spread over their
+surroundings (:func:`spread`): light is neither lost nor gained, only where in those 31×31 pixels it lies remains
+unknown.
 """
 
 from typing import NamedTuple
@@ -24,7 +25,7 @@ MEMBERS = ((0,), (1,), (2,), (3,), (0, 1), (2, 3), (0, 1, 2, 3))
 """Renders that each of a view's seven denoised images was made of: sub-images, halves, the frame."""
 SINGLES, HALVES, WHOLE = (0, 1, 2, 3), (4, 5), 6
 
-_RENDERS = 5
+_TARGET = 4  # its number among a view's renders
 _TAIL = 2.0  # times the level: residuals beyond it are spread
 _SPREAD = 31  # pixels, odd
 _BARE = 0.1  # share of the samples that lack a feature, of each feature
@@ -66,7 +67,8 @@ class Sample(NamedTuple):
 class Memory(NamedTuple):
     """A view in planes, with half floats where its file has them: a thousand of 128×128 take 3.3 GB."""
 
-    color: Tensor  # (5, 3, H, W) float32
+    color: Tensor  # (4, 3, H, W) float32, sub-images
+    target: Tensor  # (3, H, W) float32, without outliers
     denoised: dict[str, Tensor]  # (7, 3, H, W) float16
     albedo: Tensor
     normal: Tensor
@@ -75,8 +77,10 @@ class Memory(NamedTuple):
     @classmethod
     def of(cls, view: View) -> "Memory":
         """Take what training needs of a view."""
+        color = view.color.movedim(-1, -3)
         return cls(
-            view.color.movedim(-1, -3).contiguous(),
+            color[:_TARGET].contiguous(),
+            spread(color[_TARGET], view.smooth.movedim(-1, -3)),
             {name: image.movedim(-1, -3).half().contiguous() for name, image in view.denoised.items()},
             view.albedo.movedim(-1, -3).half().contiguous(),
             view.normal.movedim(-1, -3).half().contiguous(),
@@ -86,11 +90,6 @@ class Memory(NamedTuple):
     def noisy(self, keys: tuple[int, ...]) -> Tensor:
         """The noisy images (B, 3, H, W) whose denoised ones have these numbers."""
         return torch.stack([self.color[list(MEMBERS[key])].mean(0) for key in keys])
-
-    def target(self, keys: tuple[int, ...]) -> Tensor:
-        """Mean of the renders that are in none of these, (3, H, W)."""
-        used = {member for key in keys for member in MEMBERS[key]}
-        return self.color[[i for i in range(_RENDERS) if i not in used]].mean(0)
 
 
 def draw(
@@ -112,7 +111,7 @@ def draw(
         generator: of what is random here.
         crop: side in pixels; the whole view where it is not larger.
         biased: images (K, 3, H, W) to go along.
-        taught: the target is OIDN's image of the frame instead of the renders that are left.
+        taught: the target is OIDN's image of the frame instead of the render.
     """
     noisy = memory.noisy(keys)
     level = memory.denoised["oidn"][list(keys)].float().mean(0)
@@ -121,7 +120,7 @@ def draw(
         noisy,
         memory.denoised[denoiser][list(keys)].float(),
         noisy[:0] if biased is None else biased,
-        memory.denoised["oidn"][WHOLE].float() if taught else spread(memory.target(keys), level),
+        memory.denoised["oidn"][WHOLE].float() if taught else memory.target,
         level,
     ]
     noisy, denoised, biased, target, level = (image * exposure for image in radiance)
@@ -146,7 +145,7 @@ def level_of(image: Tensor) -> Tensor:
 
 
 def spread(target: Tensor, level: Tensor) -> Tensor:
-    """The target with what its outliers differ from the level by beyond a bound spread around them, (3, H, W).
+    """The target with what its outliers differ from the level, itself denoised, by beyond a bound spread around them.
 
     Means over windows of 31×31 pixels stay what they are, but for windows across the border, which is mirrored.
     """

@@ -1,7 +1,7 @@
 """What each network is, what it is shown, what its loss is, and what it is measured by.
 
-All losses are relative squared errors; how outliers of noisy targets are met without teaching to darken: see
-:mod:`samples`.
+All losses are relative squared errors, weighted so that no few views decide everything; how outliers of noisy targets
+are met without teaching to darken: see :mod:`samples`.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,7 @@ from torch.nn import functional as F
 from selfcorrect.frame import Half
 from selfcorrect.stages.deep_combiner import DeepCombiner
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
+from selfcorrect.stages.layers import tau
 from selfcorrect.stages.neural_james_stein import VarianceNetwork, neural_blend, tau_loss
 from selfcorrect.stages.regression import cross_buffer_regression
 
@@ -26,6 +27,7 @@ _REGRESSION_STRIDE = 4  # of the biased images in training: a view takes 0.1 s
 _PAIRS = (((0, 1), 4), ((2, 3), 5), (HALVES, WHOLE))
 """Inputs of equal noise, and the number of their mean."""
 _BLURRED = 11  # pixels, side of the box that makes a bad biased image
+_LEAST_ERROR = 1e-4  # of a view's inputs: that of a target of 256 samples is not less
 
 
 class Judged(NamedTuple):
@@ -51,7 +53,7 @@ class Task(Protocol):
         ...
 
     def losses(self, network: nn.Module, batch: Sample) -> Tensor:
-        """The loss of each sample of a batch, (N,)."""
+        """The loss of each sample of a batch, (N,), with its weight."""
         ...
 
     def judge(self, network: nn.Module, view: View) -> list[Judged]:
@@ -62,6 +64,11 @@ class Task(Protocol):
 def relative_squared(result: Tensor, target: Tensor, level: Tensor) -> Tensor:
     """Relative L2 of each image of (N, 3, H, W) with the weight of the level, (N,)."""
     return (((result.float() - target) ** 2).mean(1) / (level.mean(1) ** 2 + 0.01)).mean((1, 2))
+
+
+def tone_mapped(result: Tensor, target: Tensor, level: Tensor) -> Tensor:
+    """The same of τ(radiance), which bounds what bright pixels count for; for targets of little noise only."""
+    return relative_squared(tau(result.float()), tau(target), tau(level))
 
 
 class DenoiserTask:
@@ -90,7 +97,7 @@ class DenoiserTask:
         """See :class:`Task`; the network undoes the exposure of the batch, so it gets its own."""
         exposure = torch.stack([level_of(image) for image in batch.level])[:, None, None, None]
         result = network(batch.noisy[:, 0], batch.albedo, batch.normal, exposure)
-        return relative_squared(result, batch.target, batch.level)
+        return relative_squared(result, batch.target, batch.level) * batch.importance
 
     def judge(self, network: nn.Module, view: View) -> list[Judged]:
         """See :class:`Task`."""
@@ -103,7 +110,11 @@ class DenoiserTask:
 
 
 class CombinerTask:
-    """Noisy and denoised images of all denoisers, OIDN's half of the time; relative L2."""
+    """Noisy and denoised images of all of a view's denoisers; tone-mapped relative L2 over the better input's.
+
+    Over the better input's, since the errors of views differ by factors of a thousand: so each view counts for the
+    share of its error that could be gained, and 1 minus the loss is that gain.
+    """
 
     baseline = "denoised"
 
@@ -118,11 +129,15 @@ class CombinerTask:
     def sample(self, number: int, memory: Memory, generator: torch.Generator) -> Sample:
         """See :class:`Task`."""
         keys = (_input(generator),) if self.buffers == 1 else _drawn(SINGLES, self.buffers, generator)
-        return draw(memory, keys, _denoiser(memory, generator), generator, crop=self.crop)
+        denoiser = _other(memory, int(torch.randint(2**31 - 1, (), generator=generator)))
+        return draw(memory, keys, denoiser, generator, crop=self.crop)
 
     def losses(self, network: nn.Module, batch: Sample) -> Tensor:
         """See :class:`Task`."""
-        return relative_squared(network(batch.noisy, batch.denoised, batch.features), batch.target, batch.level)
+        result = network(batch.noisy, batch.denoised, batch.features)
+        inputs = (batch.denoised.mean(1), batch.noisy.mean(1))
+        start = torch.stack([tone_mapped(image, batch.target, batch.level) for image in inputs]).amin(0)
+        return tone_mapped(result, batch.target, batch.level) / (start + _LEAST_ERROR)
 
     def judge(self, network: nn.Module, view: View) -> list[Judged]:
         """See :class:`Task`; one result for each denoiser."""
@@ -188,7 +203,8 @@ class JamesSteinTask:
         """See :class:`Task`."""
         theta = _blend(network, batch.noisy, batch.biased)
         each = zip(theta, batch.target, batch.level, strict=True)
-        return torch.stack([tau_loss(t[None], target[None], level[None]) for t, target, level in each])
+        losses = torch.stack([tau_loss(t[None], target[None], level[None]) for t, target, level in each])
+        return losses * batch.importance
 
     def judge(self, network: nn.Module, view: View) -> list[Judged]:
         """See :class:`Task`; with OIDN's images as the stage gets them, their regression, and a box filter."""

@@ -4,10 +4,13 @@
     .venv/bin/python scripts/train/train.py deep-combiner --width 32 --kernel 3 --data DATASET --out RUN --steps 5000
 
 Networks: denoiser, james-stein, deep-combiner, deep-combiner-4; what each is shown and its loss: ``tasks.py``. AdamW, a
-short warm-up, then a cosine to 0 over the steps or minutes given; bf16 autocast; an exponential mean of the weights is
-what is validated and exported. Targets are noisy, and their fireflies are not clamped: where the gradient's norm is
-over twice its running geometric mean, it is scaled down to that. That bounds what one firefly does, and darkens a
-little: the column radiance of the validation says how much.
+short warm-up, then a cosine to 0 over the steps or minutes given; bf16 autocast where the processor has it; an
+exponential mean of the weights is what is validated and exported. Targets are noisy, and their fireflies are not
+clamped: where the gradient's norm is over twice its running geometric mean, it is scaled down to that. That bounds what
+one firefly does, and darkens a little: the column radiance of the validation says how much.
+
+``--hold-out NAME`` trains on no view of that scene and validates on those alone; ``--at-most N`` trains on the first N
+views: several runs are a learning curve.
 
 RUN gets ``checkpoint.pt`` (every minute, under a temporary name first), ``losses.csv`` (each step), ``validation.csv``
 (every five minutes, with clean references) and ``curves.png``. The same command goes on where a killed one was; with
@@ -33,6 +36,7 @@ from tasks import TASKS, Task, task_of
 from torch import nn
 
 from selfcorrect import metrics
+from selfcorrect.stages.tiled import autocast
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -80,9 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
-    files = {part: dataset.views(options.data / part) for part in ("train", "validation")}
-    if not files["train"]:
-        raise SystemExit(f"{options.data / 'train'}: expected views (*.safetensors), but found none")
+    files = files_of(options)
     settings = settings_of(options, dataset.checksum(files["train"]))
     task = task_of(options.network, settings["architecture"], options.seed, options.crop)
     run = begin(task, options)
@@ -106,6 +108,19 @@ def main(arguments: list[str] | None = None) -> None:
 
     train(run, task, memories, held_out, options, save)
     draw_curves(run, task.baseline, options.out / "curves.png")
+
+
+def files_of(options: argparse.Namespace) -> dict[str, list[Path]]:
+    """The views to train on and to validate on."""
+    files = {part: dataset.views(options.data / part) for part in ("train", "validation")}
+    if options.hold_out:
+        scenes = {path: dataset.metadata_of(path)["scene"] for paths in files.values() for path in paths}
+        files["train"] = [path for path in files["train"] if scenes[path] != options.hold_out]
+        files["validation"] = [path for path in files["validation"] if scenes[path] == options.hold_out]
+    files["train"] = files["train"][: options.at_most]
+    if not files["train"]:
+        raise SystemExit(f"{options.data / 'train'}: expected views (*.safetensors), but found none")
+    return files
 
 
 def settings_of(options: argparse.Namespace, checksum: str) -> dict[str, Any]:
@@ -182,9 +197,9 @@ def batch_of(step: int, task: Task, memories: list[Memory], options: argparse.Na
 def optimise(run: Run, task: Task, batch: Sample, rate: float) -> None:
     """One step."""
     run.network.train()
-    with torch.autocast("cpu", torch.bfloat16):
+    with autocast(batch.target, "bf16"):
         losses = task.losses(run.network, batch)
-    loss = (losses.float() * batch.importance).mean()
+    loss = losses.float().mean()
     run.optimiser.zero_grad()
     loss.backward()
     limit = LIMIT * run.typical_gradient if run.step else math.inf
@@ -277,12 +292,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--weight-decay", type=float, default=1e-4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--hold-out", metavar="SCENE")
+    parser.add_argument("--at-most", type=int, metavar="VIEWS")
     parser.add_argument("--initial", type=Path, help="a finished run, whose weights this one starts from")
     parser.add_argument("--validation-views", type=int, default=40)
     parser.add_argument("--validate-minutes", type=float, default=5.0)
     parser.add_argument("--checkpoint-seconds", type=float, default=60.0)
-    parser.add_argument("--anchored", action="store_true", default=None, help="of the combiners")
-    for name in ARCHITECTURE[:-1]:
+    for name in ARCHITECTURE:
         parser.add_argument(f"--{name}", type=int, help="of the combiners, other than the published one")
     return parser.parse_args(arguments)
 

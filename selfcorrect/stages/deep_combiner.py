@@ -28,6 +28,7 @@ __all__ = ["DeepCombiner", "DeepCombinerStage", "combine_whole", "combined", "fe
 
 _FEATURES = 7  # normal, albedo, depth
 _FIRST_ANCHOR = 4  # of the window's weights together: training starts near the denoised image
+_FIRST_CENTRE = 0.02  # of them, where the centre's weight is scaled: enough for a gradient, too little for its noise
 _LEAST_SUM = 1e-10  # as published
 _BEYOND = 1e9  # depth from here on is a renderer's word for nothing hit (Blender's is 1e10)
 
@@ -50,7 +51,10 @@ class DeepCombiner(TrainedNetwork):
         layers: convolutions.
         kernel: side of the convolutions' kernels, odd.
         anchored: one more output for each buffer, the weight of the denoised image as it is, a residual of 0. Weights
-            that are normalised without one must take in the residuals' noise everywhere. Not in the paper.
+            that are normalised without one must take in the residuals' noise everywhere. The number says what it is
+            multiplied by, and the centre's weight, too, 0 (False) that there is none: the window has hundreds of
+            weights, and an optimiser that moves every weight by the same step would need thousands of steps to move a
+            single one to where it counts for as much as they do. Not in the paper.
         seed: of the first weights.
     """
 
@@ -64,7 +68,7 @@ class DeepCombiner(TrainedNetwork):
         layers: int = 6,
         kernel: int = 5,
         *,
-        anchored: bool = False,
+        anchored: int = 0,
         seed: int = 0,
     ):
         super().__init__()
@@ -80,12 +84,16 @@ class DeepCombiner(TrainedNetwork):
         self.pairs, self.window = buffers, window
         self.reach = layers * (kernel // 2)
         """Pixels that a weight sees on each side."""
-        taps = window**2 + anchored
+        taps = window**2 + bool(anchored)
+        self.scaled = {window**2 // 2: anchored, window**2: anchored} if anchored > 1 else {}
+        """What the outputs of these numbers are multiplied by."""
         widths = [6 * buffers + _FEATURES, *[width] * (layers - 1), buffers * taps]
         made = [convolution(i, o, kernel, generator) for i, o in pairwise(widths)]
         self.convolutions = nn.ModuleList(made)
         first = torch.ones(buffers, taps)
-        first[:, window**2 :] = _FIRST_ANCHOR * window**2
+        first[:, window**2 :] = _FIRST_ANCHOR * window**2 / max(anchored, 1)
+        if self.scaled:
+            first[:, window**2 // 2] = _FIRST_CENTRE * window**2 / anchored
         start_flat(made[-1], first.flatten())
 
     def forward(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
@@ -107,6 +115,11 @@ class DeepCombiner(TrainedNetwork):
         for layer in self.convolutions:
             planes = layer(planes).relu()
         weights: Tensor = planes.unflatten(1, (self.pairs, -1))
+        if self.scaled:
+            scale = weights.new_ones(weights.shape[2], 1, 1)
+            for tap, factor in self.scaled.items():
+                scale[tap] = factor
+            weights = weights * scale
         return weights
 
 

@@ -22,11 +22,12 @@ def make_view(seed: int, side: int, *, clean: bool) -> dataset.View:
     normal = torch.nn.functional.normalize(
         torch.stack([x / side - 0.5, y / side - 0.5, torch.ones_like(x)], -1), dim=-1
     )
+    noise[4] = 1 + (noise[4] - 1) / 8  # of the target, which has more samples
     color = truth * (0.5 + 0.5 * noise)
     images = dataset.inputs_of(color)
     denoised = {name: _denoised(name, images, albedo, normal) for name in DENOISERS}
-    references = (torch.stack([truth, truth]), truth) if clean else (None, None)
-    return dataset.View("", "stripes", 16, color, albedo, normal, 1.0 + y / side, denoised, *references)
+    smooth, reference = (truth, torch.stack([truth, truth])) if clean else (color[4].clone(), None)
+    return dataset.View("", "stripes", 16, color, albedo, normal, 1.0 + y / side, denoised, smooth, reference)
 
 
 def write_dataset(folder: Path, *, views: int = 6, side: int = 48) -> Path:

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import cut_frames
 import dataset
 import evaluate
 import export
@@ -26,6 +27,7 @@ from samples import HALVES, MEMBERS, SINGLES, WHOLE, Memory, draw, spread
 from torch import Tensor
 
 import denoisers
+from selfcorrect import Frame
 from selfcorrect.errors import DenoiserError
 from selfcorrect.stages import weights
 from selfcorrect.stages.deep_combiner import DeepCombiner
@@ -81,12 +83,9 @@ class TestSamples:
     @pytest.mark.parametrize("keys", [(0,), (4,), (WHOLE,), HALVES, (1, 3), SINGLES])
     def test_no_input_shares_a_render_with_the_target(self, keys: tuple[int, ...]) -> None:
         """Each render is a number of its own, so that the means tell which are in them."""
-        memory = self.memory()
-        values = 10.0 ** torch.arange(5).view(5, 1, 1, 1).expand(5, 3, 32, 32)
-        memory = memory._replace(color=values)
-        inputs = {member for key in keys for member in MEMBERS[key]}
-        left = [10.0**i for i in range(5) if i not in inputs]
-        assert memory.target(keys).unique().tolist() == pytest.approx([sum(left) / len(left)])
+        values = 10.0 ** torch.arange(5).view(5, 1, 1, 1).expand(5, 32, 32, 3)
+        memory = Memory.of(make_view(0, 32, clean=False)._replace(color=values, smooth=values[4]))
+        assert memory.target.unique().tolist() == [10.0**4]
         expected = [sum(10.0**i for i in MEMBERS[key]) / len(MEMBERS[key]) for key in keys]
         assert [float(image.mean()) for image in memory.noisy(keys)] == pytest.approx(expected)
 
@@ -94,7 +93,8 @@ class TestSamples:
         memory = self.memory()
         one = memory.color[0].half()
         same = memory._replace(
-            color=one.float().expand(5, 3, 32, 32),
+            color=one.float().expand(4, 3, 32, 32),
+            target=one.float(),
             denoised={"oidn": one.expand(7, 3, 32, 32)},
             albedo=one,
             depth=one[:1],
@@ -125,6 +125,23 @@ class TestSamples:
         )
         assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
         assert not torch.equal(first.noisy, other.noisy)
+
+
+class TestCutFrames:
+    def test_pieces_hold_what_the_frame_has_there(self) -> None:
+        pair = [(image, image + 1) for image in torch.rand(5, 20, 36, 3)]
+        color, albedo, normal, depth, reference = pair
+        frame = Frame(color=color, albedo=albedo, normal=normal, depth=tuple(image[..., :1] for image in depth))
+        made = torch.arange(7.0).view(7, 1, 1, 1) + color[0]
+        found = list(cut_frames.views("x", frame, {"oidn": made}, torch.stack(reference), color[0], 16))
+        assert [view.name for view in found] == ["x-0002-0002", "x-0002-0018"]
+        memory = Memory.of(found[1])
+        at = (slice(2, 18), slice(18, 34))
+        expected = {4: color[0][at], 5: color[1][at], WHOLE: color[0][at] + 0.5}
+        for key, value in expected.items():
+            torch.testing.assert_close(memory.noisy((key,))[0], value.permute(2, 0, 1))
+        torch.testing.assert_close(found[1].color[4], reference[0][at] + 0.5)
+        torch.testing.assert_close(found[1].denoised["oidn"][WHOLE], 6 + color[0][at])
 
 
 class TestDenoiser:
@@ -186,6 +203,17 @@ class TestTraining:
         ]
         for name in ("network", "mean"):
             assert all(torch.equal(a, b) for a, b in zip(*(state[name].values() for state in states), strict=True))
+
+    def test_a_scene_is_held_out(self, tmp_path: Path) -> None:
+        """Training sees no view of it, validation nothing else."""
+        for part, scene in itertools.product(("train", "validation"), ("one", "two")):
+            (tmp_path / part).mkdir(exist_ok=True)
+            view = make_view(0, 16, clean=part == "validation")._replace(scene=scene)
+            dataset.save(tmp_path / part / f"{scene}.safetensors", view, {})
+        options = train.parse(["denoiser", "--steps", "1", "--out", "x", "--data", str(tmp_path), "--hold-out", "two"])
+        found = train.files_of(options)
+        assert [path.stem for path in found["train"]] == ["one"]
+        assert [path.stem for path in found["validation"]] == ["two"]
 
     def test_another_run_is_not_continued(self, data: Path, runs: Path) -> None:
         with pytest.raises(SystemExit, match="use another --out"):

@@ -39,8 +39,8 @@ def test_a_narrower_one() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 7), (13, 11)])
-@pytest.mark.parametrize(("buffers", "anchored"), [(1, False), (4, False), (1, True), (4, True)])
-def test_eq_14_by_hand(size: tuple[int, int], buffers: int, anchored: bool) -> None:
+@pytest.mark.parametrize(("buffers", "anchored"), [(1, 0), (4, 0), (1, 1), (4, 1), (1, 25)])
+def test_eq_14_by_hand(size: tuple[int, int], buffers: int, anchored: int) -> None:
     """Eq. 8 is Eq. 14 with one buffer: window² weights, y_i − z_i + z_c under each, one sum of weights.
 
     An anchor is a weight more, with z_c under it.
@@ -88,6 +88,18 @@ def test_four_buffers_reject_an_outlier() -> None:
     noisy[:, 2], denoised[:, 2] = 50.0, 30.0
     got = combined(weights, reflected(noisy - denoised, 2), denoised, 5)
     torch.testing.assert_close(got, expected, **near("combiner and outlier"))
+
+
+def test_a_scaled_one_starts_at_the_denoised_image() -> None:
+    """The weights of the image as it is and of the centre start as the others' sum has it, from small outputs."""
+    noisy, denoised, features = images((40, 40))
+    network = DeepCombiner(**SMALL | {"width": 32}, anchored=25)
+    with torch.no_grad():
+        mean = network.weights(noisy, denoised, features)[0, 0].mean((1, 2))
+        got = network(noisy, denoised, features)
+    assert 3 < mean[25] / 25 < 5
+    assert 0 < mean[12] / 25 < 0.2
+    assert float((got - denoised[:, 0]).square().mean()) < 0.01 * float((noisy - denoised).square().mean())
 
 
 def test_an_untrained_one_adds_the_local_mean_residual() -> None:
