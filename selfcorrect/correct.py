@@ -13,7 +13,7 @@ from selfcorrect import stages
 from selfcorrect.errors import DeviceError, FrameError
 from selfcorrect.fireflies import Removed, remove_fireflies_
 from selfcorrect.frame import Candidate, Frame
-from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_light_
+from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_above_, keep_light_
 from selfcorrect.history import with_history
 from selfcorrect.image.bands import bands, enlarged_rows
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
@@ -269,6 +269,7 @@ class _Judge:
         self._blend_halves_(guarded.alpha)
         if not guarded.estimate.improved:
             return image.copy_(first.full), guarded  # not the frame's own tensor: the caller may change the result
+        keep_above_(image, full, first.scaled_color)
         keep_light_(image, full, first.scaled_color)
         return scale_(image, 1 / first.scale).clamp_(min=0), guarded
 

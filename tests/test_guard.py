@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from helpers.tolerances import EXACT, LIGHT, near
 from torch import Tensor
 
-from selfcorrect.guard import Estimate, Evidence, Guarded, Pair, keep_light_
+from selfcorrect.guard import Estimate, Evidence, Guarded, Pair, keep_above_, keep_light_
 from selfcorrect.guard import guard as guard_by_evidence
 from selfcorrect.image import bands
 from selfcorrect.stages.core.transfer import gained_by_both
@@ -174,6 +174,26 @@ def test_light_is_kept() -> None:
     assert torch.equal(keep_light_(scene(), scene(), color), scene())
     black = torch.zeros(*SIZE, 3)
     assert torch.equal(keep_light_(black, scene(), color), black)
+
+
+@pytest.mark.parametrize("at", [(0, 0), (31, 7), (32, 8), (SIZE[0] - 1, SIZE[1] - 1)])
+def test_no_pixel_is_darker_than_all_that_was_seen(at: tuple[int, int]) -> None:
+    """Neither than the denoised image; what the halves have met in their mean, and all that is brighter, stays."""
+    color, denoised = (torch.full((*SIZE, 3), 0.5), torch.full((*SIZE, 3), 0.7)), torch.ones(*SIZE, 3)
+    image = torch.full((*SIZE, 3), 0.6)
+    image[at] = torch.tensor([0.0, 0.599, 3.0])
+    kept = keep_above_(image.clone(), denoised, color)
+    assert kept[at].tolist() == pytest.approx([0.6, 0.6, 3.0])
+    changed = (kept != image).any(-1)
+    assert changed.nonzero().tolist() == [list(at)]
+
+    dim = denoised.clone()
+    dim[at] = 0.2
+    assert keep_above_(image.clone(), dim, color)[at].tolist() == pytest.approx([0.2, 0.599, 3.0])
+    dark = tuple(half.clone() for half in color)
+    for half in dark:
+        half[min(at[0] + 1, SIZE[0] - 1), max(at[1] - 1, 0)] = 0.1
+    assert keep_above_(image.clone(), denoised, (dark[0], dark[1]))[at].tolist() == pytest.approx([0.1, 0.599, 3.0])
 
 
 @pytest.mark.parametrize("improves", [True, False])
