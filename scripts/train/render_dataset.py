@@ -189,12 +189,12 @@ def scene_of(scenes: Path, seed: int, part: str, number: int) -> str:
 def training_view(job: Job, name: str, number: int) -> tuple[View, dict[str, str]]:
     """The view of that number: its camera, materials and lights drawn by it and the seed."""
     rng = np.random.default_rng((job.seed, number, 1))
+    spp = int(rng.choice(SPP))  # first: how many numbers a camera takes depends on what rays meet
+    drawn = rng.choice(list(EXTRA), EXTRAS, replace=False, p=list(EXTRA.values())).tolist()
+    extra = tuple(spec for spec in drawn if spec != CRN or job.variant == LLVM)
     place, reserved = _loaded(job.scenes, name, job.size), _reserved(job, name)
     place.variation.draw(rng)
     camera = _chosen_camera(job, place, reserved, rng)
-    spp = int(rng.choice(SPP))
-    drawn = rng.choice(list(EXTRA), EXTRAS, replace=False, p=list(EXTRA.values())).tolist()
-    extra = tuple(spec for spec in drawn if spec != CRN or job.variant == LLVM)
     return _view(job, place, Shot(number, name, camera, spp, job.target_spp, extra), rng)
 
 
