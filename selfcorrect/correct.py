@@ -14,7 +14,7 @@ from selfcorrect.errors import DeviceError, FrameError
 from selfcorrect.fireflies import Removed, remove_fireflies_
 from selfcorrect.frame import Candidate, Frame
 from selfcorrect.guard import Estimate, Evidence, Guarded, guard, keep_above_, keep_light_
-from selfcorrect.history import with_history
+from selfcorrect.history import NAME, with_history
 from selfcorrect.image.bands import bands, enlarged_rows
 from selfcorrect.image.exposure import Scaled, scale_, scale_to_one
 from selfcorrect.independence import dependence
@@ -194,8 +194,9 @@ def correct(
 
 
 def _remembering(frame: Frame, settings: Settings, denoiser: Callable[..., Any] | None) -> Frame:
-    """The frame with what its neighbours know of it, which optical flow finds on the CPU."""
-    if not (frame.neighbours and settings.guard and settings.frame_radius):
+    """The frame with what its neighbours know of it, which optical flow finds on the CPU; a shot knows it already."""
+    known = any(candidate.name == NAME for candidate in frame.more)
+    if known or not (frame.neighbours and settings.guard and settings.frame_radius):
         return frame
     around = {distance: neighbour.to("cpu") for distance, neighbour in frame.neighbours.items()}
     remembered, _ = with_history(frame.to("cpu"), around, denoiser, radius=settings.frame_radius)

@@ -179,6 +179,8 @@ def test_one_frame_with_its_neighbours_is_what_a_shot_makes_of_it() -> None:
     result = correct(given, replace(SETTINGS, frame_radius=2), denoiser=demodulated)
     assert torch.equal(result.image, correct(remembered, SETTINGS).image)
     assert list(result.shares) == ["history", "stages"]
+    known = replace(remembered, neighbours=around)  # as in a shot, whose frames may have theirs: not found twice
+    assert list(correct(known, replace(SETTINGS, frame_radius=2)).shares) == ["history", "stages"]
     for off in (replace(SETTINGS, frame_radius=0), replace(SETTINGS, frame_radius=2, guard=False)):
         assert torch.equal(correct(given, off, denoiser=demodulated).image, correct(frame(still, HERE), off).image)
 
