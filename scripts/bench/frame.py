@@ -37,7 +37,6 @@ from selfcorrect.stages.core.patches import steps_count
 
 Size = tuple[int, int]  # width, height
 
-
 COLUMNS = (
     *("size", "run", "denoise", "candidates", "train", "infer", "correction"),
     *("of OIDN's time", "of paper's", "overhead", "peak GiB"),
