@@ -10,7 +10,7 @@ from torch import Tensor
 
 from selfcorrect.buffers import BUFFERS, COLOR, DENOISED, FEATURES, Buffer
 from selfcorrect.errors import FrameError
-from selfcorrect.image.bands import bands
+from selfcorrect.image.bands import in_bands
 from selfcorrect.image.repair import Repairs, as_tensor, check_finite, repair
 
 __all__ = ["Candidate", "DualDenoiser", "Frame", "Half", "checked", "mean", "prefiltered"]
@@ -290,8 +290,11 @@ def _check_neighbour(distance: int, neighbour: object) -> None:
 def mean(pair: Pair) -> Tensor:
     """Mean of both halves, float32; by way of float64, as the sum of two large values may exceed float32."""
     average: Tensor = torch.empty_like(pair[0], dtype=torch.float32)
-    for rows in bands(len(average)):
+
+    def halve(rows: slice) -> None:
         average[rows] = (pair[0][rows].double() + pair[1][rows].double()) / 2
+
+    in_bands(len(average), halve)
     return average
 
 

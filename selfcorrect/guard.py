@@ -26,9 +26,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from selfcorrect.image.bands import average, bands, enlarged, enlarged_rows, tile_means, widened
+from selfcorrect.image.bands import average, enlarged, enlarged_rows, in_bands, tile_means, widened
 from selfcorrect.image.channels import channel_mean
-from selfcorrect.image.exposure import Radiance
+from selfcorrect.image.exposure import Radiance, scale_
 from selfcorrect.pooling import pairs, pooled, taken_off
 
 __all__ = ["CERTAIN", "Estimate", "Evidence", "Guarded", "guard", "keep_above_", "keep_light_"]
@@ -161,7 +161,8 @@ class Evidence:
         No half may have seen its witness but through the network's 20,303 weights.
         """
         self._rows += rows.stop - rows.start
-        for part in bands(rows.stop - rows.start):
+
+        def gather(part: slice) -> None:
             band = slice(rows.start + part.start, rows.start + part.stop)
             y, z = self.y(band), self.z(band)
             for i in (0, 1):
@@ -171,6 +172,8 @@ class Evidence:
                 products += [changes[k] * changes[m] for k, m in pairs(self.candidates)]
                 for plane, product in enumerate(products):
                     self._nd[i, plane, band] = weight * channel_mean(product)
+
+        in_bands(rows.stop - rows.start, gather)
 
     def y(self, rows: slice) -> list[Tensor]:
         """The noisy halves."""
@@ -253,12 +256,15 @@ def guard(
     shares = tuple(part / means[1] if improved else 0.0 for part in means[2:])
 
     alpha = pooled(size, evidence.both, count) if improved else gain.new_zeros(count, 1, 1)
-    for rows in bands(size[0]):
+
+    def blend(rows: slice) -> None:
         full, weights = denoised_full[rows].double(), enlarged_rows(alpha, size, rows)
-        blend = full
+        blended = full
         for weight, image in zip(weights, images, strict=True):
-            blend = blend + weight[:, :, None] * (image[rows].double() - full)
-        out[rows] = blend
+            blended = blended + weight[:, :, None] * (image[rows].double() - full)
+        out[rows] = blended
+
+    in_bands(size[0], blend)
 
     def squares(rows: slice) -> Tensor:
         """Mean squared differences, and the gain, by which :func:`_estimate` knows errors."""
@@ -350,11 +356,14 @@ def keep_above_(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:
         denoised: the same of the denoised mean of the halves.
         color: noisy halves.
     """
-    for rows in bands(image.shape[0]):
+
+    def keep(rows: slice) -> None:
         wide, inner = widened(rows, 1, image.shape[0])
         noisy = (color[0][wide].double() + color[1][wide].double()) / 2
         least = -F.max_pool2d(-noisy.permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)[inner]
         image[rows] = torch.maximum(image[rows].double(), torch.minimum(least, denoised[rows].double()))
+
+    in_bands(image.shape[0], keep)
     return image
 
 
@@ -381,11 +390,11 @@ def keep_light_(image: Tensor, denoised: Radiance, color: Pair) -> Tensor:
         reachable = min(max(mean, wanted / _LARGEST_SCALE), wanted * _LARGEST_SCALE)
         share = min(1.0, (reachable - mean) / (kept - mean))
         lost = tile_means(size[0], lambda rows: (denoised[rows].double() - image[rows].double()).permute(2, 0, 1))
-        for rows in bands(size[0]):
+
+        def give_back(rows: slice) -> None:
             returned = share * enlarged_rows(lost, size, rows).permute(1, 2, 0)
             image[rows] = (image[rows].double() + returned).clamp(min=0)
+
+        in_bands(size[0], give_back)
         (mean,) = average(tile_means(size[0], lambda rows: channel_mean(image[rows].double())[None]), size)
-    scale = min(max(wanted / mean, 1 / _LARGEST_SCALE), _LARGEST_SCALE)
-    for rows in bands(size[0]):
-        image[rows] = image[rows].double() * scale
-    return image
+    return scale_(image, min(max(wanted / mean, 1 / _LARGEST_SCALE), _LARGEST_SCALE))

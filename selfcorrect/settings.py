@@ -171,7 +171,12 @@ class Settings:
     rate_from_variance: bool = _setting(
         True, "multiply the rate by the root of the halves' variance", f"{_PAPER}, published code"
     )
-    schedule: str = _setting("constant", "of the rate over the steps", _OURS, choices=("constant", "cosine"))
+    schedule: str = _setting(
+        "constant",
+        "of the rate over the steps; averaged is constant, and the network is the mean of its last quarter",
+        _OURS,
+        choices=("constant", "cosine", "averaged"),
+    )
     gradient_limit: float = _setting(0.0, "largest norm of the gradient; 0 sets none", _OURS)
     adam_epsilon: float = _setting(1e-7, "Adam's epsilon", f"{_PAPER}, published code")
     loss_epsilon: float = _setting(0.01, "added to the squared radiance in the loss", f"{_PAPER}, Eq. 8", least=1e-12)

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from selfcorrect.image.bands import average, bands, tile_means
+from selfcorrect.image.bands import average, in_bands, tile_means
 from selfcorrect.image.channels import channel_mean
 
 __all__ = ["LARGEST", "Radiance", "Scaled", "scale_", "scale_to_one"]
@@ -40,8 +40,11 @@ class Scaled:
 def scale_(image: Tensor, factor: float) -> Tensor:
     """Radiance times a factor, in place; bounded by what float32 holds."""
     largest = torch.finfo(torch.float32).max
-    for rows in bands(image.shape[0]):
+
+    def scale(rows: slice) -> None:
         image[rows] = (image[rows].double() * factor).clamp_(-largest, largest)
+
+    in_bands(image.shape[0], scale)
     return image
 
 

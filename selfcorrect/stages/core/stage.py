@@ -12,7 +12,7 @@ from torch import Tensor
 
 from selfcorrect.buffers import DENOISED
 from selfcorrect.frame import Half, mean
-from selfcorrect.image.bands import bands, enlarged_rows
+from selfcorrect.image.bands import bands, enlarged_rows, in_bands
 from selfcorrect.image.exposure import Scaled, scale_
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.settings import Settings
@@ -68,14 +68,17 @@ def inferred(state: StageImages, network: Network, settings: Settings, keep: Kee
     image = torch.empty_like(state.full)
     size = (image.shape[0], image.shape[1])
     gained = gained_by_both(images, full) if settings.inference == "full" else None
+
+    def add(top: int, halves: tuple[Tensor, Tensor], part: slice) -> None:
+        own = slice(top + part.start, top + part.stop)
+        image[own] = mean((halves[0][part], halves[1][part]))
+        if gained is not None:
+            share = enlarged_rows(gained, size, own)[0, :, :, None]
+            image[own] += share.to(image.dtype) * (full[own] - mean((images[0][own], images[1][own])))
+
     for rows in bands(size[0], SIDE):
         a, b = (infer(network, half, settings, scale=state.scale, rows=rows) for half in state.halves)
-        for part in bands(rows.stop - rows.start):
-            own = slice(rows.start + part.start, rows.start + part.stop)
-            image[own] = mean((a[part], b[part]))
-            if gained is not None:
-                share = enlarged_rows(gained, size, own)[0, :, :, None]
-                image[own] += share.to(image.dtype) * (full[own] - mean((images[0][own], images[1][own])))
+        in_bands(rows.stop - rows.start, partial(add, rows.start, (a, b)))
         keep(rows, (a, b))
     return scale_(image.clamp_(min=0), 1 / state.scale)
 
