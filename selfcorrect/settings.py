@@ -146,7 +146,7 @@ class Settings:
     layers: int = _setting(9, "3x3 convolutions", f"{_PAPER}, Sec. 4", least=2, most=256)
     precision: str = _setting(
         "fp32",
-        "of the convolutions: fp32, or bf16 where the processor has matrix tiles",
+        "of the convolutions: fp32, or bf16 where the processor has products or matrix tiles of it",
         f"{_PAPER}, published code",
         choices=("fp32", "bf16"),
     )

@@ -15,7 +15,7 @@ __all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "has_fast_bf
 
 def has_fast_bf16(device: torch.device) -> bool:
     """Whether torch's own convolutions in bfloat16 are fast there; else they are emulated."""
-    return gpu.has_fast_bf16(device) or (device.type == "cpu" and "amx" in cpu.instruction_sets())
+    return gpu.has_fast_bf16(device) or (device.type == "cpu" and not {*cpu.BF16}.isdisjoint(cpu.instruction_sets()))
 
 
 def convolutions(
@@ -37,7 +37,8 @@ def convolutions(
         region: top, left, bottom, right of the pixels whose heads are wanted; by default all. The compiled form gives
             no gradients of a part.
         precision: "fp32", or "bf16": weights, activations and upstream gradients are rounded to bfloat16, sums are
-            in float32. Processors without matrix tiles (AMX), and cards without them, compute in float32 then, too.
+            in float32. Processors without AVX512-BF16 or matrix tiles (AMX), and cards without tiles, compute in
+            float32 then, too.
         threads: of the compiled form; no influence on the result.
         backend: as for :func:`selfcorrect.kernel.backend.choose`; layers of more than 16 channels are the reference's.
 

@@ -8,6 +8,8 @@
 
 #if defined(SELFCORRECT_AMX)
 #include "convolution_amx.h"
+#elif defined(SELFCORRECT_DOTS)
+#include "convolution_dots.h"
 #else
 #include "convolution_fp32.h"
 #endif

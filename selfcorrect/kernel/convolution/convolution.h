@@ -55,6 +55,7 @@ struct Convolution {
 };
 
 Convolution convolution_amx();
+Convolution convolution_avx512bf16();
 Convolution convolution_avx512();
 Convolution convolution_avx2();
 Convolution convolution_baseline();

@@ -6,18 +6,11 @@
 // is the right-hand operand of the sum over pixels that the weights' gradient is.
 #pragma once
 
-#include <immintrin.h>
-
-#include "convolution.h"
-#include "simd.h"
-#include "transpose.h"
+#include "convolution_bf16.h"
 
 namespace {
 
-using selfcorrect::border;
-using selfcorrect::filters;
-
-constexpr int activation_bytes = 2 * filters, gradient_bytes = 4 * filters;
+constexpr int gradient_bytes = 4 * filters;
 constexpr int tile_pixels = 16, tile_bytes = 1024;
 
 // The compiler does not know that tiles and their configuration are loaded from memory.
@@ -44,14 +37,6 @@ public:
 };
 
 using Setup = Tiles<false>;
-
-// Pairs of 32-bit halves (a of one vector, b of the other) as bf16, a below b.
-inline __m512i interleaved(__m512 a, __m512 b) {
-    const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(b, a);  // a's sixteen, then b's
-    const __m512i order = _mm512_set_epi16(31, 15, 30, 14, 29, 13, 28, 12, 27, 11, 26, 10, 25, 9, 24, 8,  //
-                                           23, 7, 22, 6, 21, 5, 20, 4, 19, 3, 18, 2, 17, 1, 16, 0);
-    return _mm512_permutexvar_epi16(order, both);
-}
 
 // Six tiles: for each row of taps the first two, then the third and nothing. `by_pixel`: a tile's row holds one
 // pixel's inputs after the other's, as activations do; else it interleaves them, as gradients do.
@@ -147,21 +132,6 @@ void convolve(const char* const* rows, int, const float* weights, int width, flo
     for (; x < width; x += tile_pixels) convolve_blocks<false, by_pixel>(rows, weights, x, out + x * filters);
 }
 
-void clear(char* row, std::int64_t from, std::int64_t to, int bytes) {
-    std::memset(row + from * bytes, 0, (to - from) * bytes);
-}
-
-void keep_activation(const float* line, int width, bool relu, char* row) {
-    const __m512 least = _mm512_set1_ps(relu ? 0.0f : -__builtin_inff());
-    for (int x = 0; x < width; x += 2) {  // an odd width's last pair reaches into the line's slack
-        const __m512 here = _mm512_max_ps(_mm512_loadu_ps(line + x * filters), least);
-        const __m512 next = _mm512_max_ps(_mm512_loadu_ps(line + (x + 1) * filters), least);
-        _mm512_storeu_si512(row + x * activation_bytes, (__m512i)_mm512_cvtne2ps_pbh(next, here));
-    }
-    clear(row, -border, 0, activation_bytes);
-    clear(row, width, selfcorrect::row_pixels(width) - border, activation_bytes);
-}
-
 // Zero where the activation was; the layer's bias gradient on the way.
 void keep_gradient(const float* line, int width, const char* activation, char* row, float* bias) {
     __m512 sum = _mm512_setzero_ps(), before = sum;
@@ -180,23 +150,6 @@ void keep_gradient(const float* line, int width, const char* activation, char* r
     clear(row, -border, -1, gradient_bytes);
     clear(row, width, selfcorrect::row_pixels(width) - border, gradient_bytes);
     _mm512_storeu_ps(bias, _mm512_add_ps(_mm512_loadu_ps(bias), sum));
-}
-
-constexpr std::int64_t padded(int width) { return selfcorrect::row_pixels(width) - 2 * border; }
-
-constexpr std::int64_t weight_scratch(int height, int width) {
-    return height * padded(width) * activation_bytes;
-}
-
-// Thirty-two pixels [pixel][16] to [16][pixel], both bf16; the rows of `to` are `pitch` bytes apart.
-inline void transpose_pixels(const char* from, char* to, std::int64_t pitch) {
-    float pairs[16 * 16], planes[16 * 16];
-    const __m512i order = _mm512_set_epi16(31, 15, 30, 14, 29, 13, 28, 12, 27, 11, 26, 10, 25, 9, 24, 8,  //
-                                           23, 7, 22, 6, 21, 5, 20, 4, 19, 3, 18, 2, 17, 1, 16, 0);
-    for (int i = 0; i < 16; ++i)
-        _mm512_storeu_si512(pairs + 16 * i, _mm512_permutexvar_epi16(order, _mm512_loadu_si512(from + 64 * i)));
-    transpose(pairs, planes);
-    for (int c = 0; c < 16; ++c) _mm512_storeu_si512(to + c * pitch, _mm512_loadu_si512(planes + 16 * c));
 }
 
 // Sums over all pixels of activation x gradient, for the taps of two rows or one.
@@ -266,10 +219,7 @@ double peak(std::int64_t rounds) {
 template <class Rows>
 void weight_gradient(const Rows& activation, const Rows& upstream, int, int height, int width, float* gradient,
                      char* scratch) {
-    const std::int64_t pitch = 2 * padded(width);
-    for (int y = 0; y < height; ++y)
-        for (int x = 0; x < width; x += 32)
-            transpose_pixels(activation(y) + x * activation_bytes, scratch + y * filters * pitch + 2 * x, pitch);
+    make_planes(activation, height, width, scratch);
     const Tiles<true> tiles;
     correlate<true>(scratch, upstream, 0, height, width, gradient);
     correlate<false>(scratch, upstream, 2, height, width, gradient);

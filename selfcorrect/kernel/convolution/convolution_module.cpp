@@ -44,6 +44,9 @@ bool has_amx() {
 
 std::vector<std::string> convolution_instruction_sets() {
     auto names = selfcorrect::instruction_sets();
+#if defined(SELFCORRECT_DOTS)
+    if (names.back() == "avx512" && __builtin_cpu_supports("avx512bf16")) names.push_back("avx512bf16");
+#endif
 #if defined(SELFCORRECT_AMX)
     static const bool amx = has_amx();
     if (amx) names.push_back("amx");
@@ -57,6 +60,9 @@ Convolution variant(const std::string& name) {
         throw std::invalid_argument("expected an instruction set this processor has, but got " + name);
 #if defined(SELFCORRECT_AMX)
     if (name == "amx") return convolution_amx();
+#endif
+#if defined(SELFCORRECT_DOTS)
+    if (name == "avx512bf16") return convolution_avx512bf16();
 #endif
 #if defined(SELFCORRECT_X86)
     if (name == "avx512") return convolution_avx512();

@@ -11,20 +11,23 @@ from selfcorrect.kernel.backend import instruction_set
 from selfcorrect.kernel.compiled import functions as _cpu
 from selfcorrect.kernel.compiled import installed
 
-__all__ = ["LARGEST_WIDTH", "best_instruction_set", "convolutions", "instruction_sets", "peak"]
+__all__ = ["BF16", "LARGEST_WIDTH", "best_instruction_set", "convolutions", "instruction_sets", "peak"]
+
+BF16 = ("avx512bf16", "amx")
+"""The variants that work in bfloat16."""
 
 LARGEST_WIDTH = 16  # channels of a layer: a vector of the widest processors
 
 
 def instruction_sets() -> list[str]:
-    """Names of the compiled variants that this processor can run, slowest first; ``amx`` works in bfloat16."""
+    """Names of the compiled variants that this processor can run, slowest first."""
     return list(_cpu.convolution_instruction_sets()) if installed() else []
 
 
 def best_instruction_set(precision: str) -> str:
-    """The fastest variant of this precision, "fp32" or "bf16"; single precision where there are no bfloat16 tiles."""
+    """The fastest variant of this precision, "fp32" or "bf16"; single precision where the processor cannot do the other."""
     names = instruction_sets()
-    return names[-1] if precision == "bf16" else [name for name in names if name != "amx"][-1]
+    return names[-1] if precision == "bf16" else [name for name in names if name not in BF16][-1]
 
 
 def peak(isa: str, rounds: int) -> float:
