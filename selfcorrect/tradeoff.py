@@ -9,7 +9,7 @@ import importlib
 import io
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -260,13 +260,20 @@ def table(measurements: Sequence[Measurement], **more: Sequence[object]) -> byte
     return text.getvalue().encode()
 
 
-def plot(measurements: Sequence[Measurement], error: str, *, title: str = "") -> bytes:
+def plot(
+    measurements: Sequence[Measurement],
+    error: str,
+    *,
+    title: str = "",
+    beside: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+) -> bytes:
     """Seconds against error, the Pareto front as a line, presets and front by name: a PNG.
 
     Args:
         measurements: one or more.
         error: what the ratio is, on the axis.
         title: above.
+        beside: curves of seconds and ratio, by name.
 
     Raises:
         MissingPackageError: matplotlib is not installed.
@@ -289,6 +296,8 @@ def plot(measurements: Sequence[Measurement], error: str, *, title: str = "") ->
             **style,
         )
     axes.plot([m.seconds for m in front], [m.ratio for m in front], drawstyle="steps-post", lw=1, label="Pareto front")
+    for label, curve in (beside or {}).items():
+        axes.plot(*zip(*curve, strict=True), color="0.4", lw=1, ls="--", label=label)
     axes.axhline(1, color="0.3", lw=0.8, ls=":")
     for m in measurements:
         if m.point.preset or m in front:

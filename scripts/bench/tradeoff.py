@@ -6,7 +6,9 @@
 Points are those of `selfcorrect bench`: presets (as they are, the guard as each of them has it), ``base`` (--preset),
 ``SETTING=VALUE,…`` on top of the base, ``PRESET:SETTING=VALUE,…``; by default its list. Each frame is read and denoised
 once. Every line is one frame and point: relMSE over the denoiser's against two references, with its standard error
-(bootstrap over 16x16 tiles), and the seconds. At the end the geometric mean over frames, the mean seconds, and the
+(bootstrap over 16x16 tiles), and the seconds, with those of the further denoisings that the settings ask for. Where
+the folder has the frame with more samples, a curve says what the denoiser alone would make of the same seconds spent on
+rendering (`equal_time.py` has how). At the end the geometric mean over frames, the mean seconds, and the
 Pareto front. --csv is written after each line; with --resume what it holds (same frame, spp, point and settings) is not
 measured again, but then seconds come from several runs. Warm starts need a shot: `scripts/bench/shot.py`.
 """
@@ -14,14 +16,21 @@ measured again, but then seconds come from several runs. Warm starts need a shot
 import argparse
 import csv
 import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import power_laws
 import torch
+from equal_time import renderer_seconds
 from quality import load
 
 import denoisers
-from selfcorrect import Settings, exr, metrics, tradeoff
+from selfcorrect import Frame, Settings, exr, metrics, tradeoff
+from selfcorrect.candidates import with_candidates
 from selfcorrect.publish import publish
 from selfcorrect.tradeoff import Measurement, Point
 
@@ -54,7 +63,10 @@ def main() -> None:
     several = summary([row for row in rows if row[0] in names and row[1] in options.spp], points)
     if picture is not None:
         title = f"{', '.join(names)}; {', '.join(map(str, options.spp))} spp"
-        publish(picture, tradeoff.plot(several, f"relMSE over that of {options.denoiser}", title=title))
+        seconds = [m.seconds for m in several]
+        curve = more_samples(options, names, torch.logspace(*(math.log10(f(seconds)) for f in (min, max)), 40).tolist())
+        error = f"relMSE over that of {options.denoiser}"
+        publish(picture, tradeoff.plot(several, error, title=title, beside={"more samples instead": curve}))
 
 
 def parse() -> argparse.Namespace:
@@ -77,10 +89,45 @@ def measured(options: argparse.Namespace, name: str, spp: int, points: list[Poin
     if not points:
         return
     frame, references = load(options.folder, name, spp)
-    frame = frame.denoise(denoisers.create(options.denoiser, threads=options.threads))
-    yield from tradeoff.sweep(
-        frame, points, lambda result: metrics.relmse_ratio(result.image, frame.denoised_full, *references)
-    )
+    frame = frame.denoise(denoisers.create(options.denoiser, threads=options.threads), keep_aids=True)
+    for mode in dict.fromkeys(p.settings.candidates for p in points):
+        start = time.perf_counter()
+        own = with_modes(options, frame, mode)
+        more = time.perf_counter() - start
+        those = [p for p in points if p.settings.candidates == mode]
+        for one in tradeoff.sweep(
+            own, those, lambda result: metrics.relmse_ratio(result.image, frame.denoised_full, *references)
+        ):
+            yield replace(one, infer=one.infer + more)
+
+
+def with_modes(options: argparse.Namespace, frame: Frame, mode: str) -> Frame:
+    """The frame with further modes of its denoiser as candidates, as the command would take them."""
+    if mode == "none":
+        return frame
+    further = {spec: denoisers.create(spec, threads=options.threads) for spec in denoisers.variants(options.denoiser)}
+    own, _ = with_candidates(frame, further, every=mode == "all")
+    return own
+
+
+def more_samples(
+    options: argparse.Namespace, names: Sequence[str], seconds: Sequence[float]
+) -> list[tuple[float, float]]:
+    """Seconds and what they would bring as samples: the denoiser's error over what it is now, geometric mean."""
+    costs, denoise = renderer_seconds(options.folder), denoisers.create(options.denoiser, threads=options.threads)
+    ratios = torch.zeros(len(seconds), dtype=torch.float64)
+    for name in names:
+        known = sorted(int(p.name.split("_")[1].removesuffix("spp")) for p in options.folder.glob(f"{name}_*spp_A.exr"))
+        errors = []
+        for spp in known:
+            frame, references = load(options.folder, name, spp)
+            errors.append(metrics.relmse(frame.denoise(denoise).denoised_full, *references))
+        for spp in options.spp:
+            now = power_laws.interpolated(known, errors, spp)
+            later = [power_laws.interpolated(known, errors, spp + s * options.threads / costs[name]) for s in seconds]
+            ratios += (torch.tensor(later, dtype=torch.float64) / now).log()
+    means = (ratios / (len(names) * len(options.spp))).exp()
+    return list(zip(seconds, means.tolist(), strict=True))
 
 
 def told(m: Measurement) -> str:

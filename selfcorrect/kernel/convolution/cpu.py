@@ -25,7 +25,7 @@ def instruction_sets() -> list[str]:
 
 
 def best_instruction_set(precision: str) -> str:
-    """The fastest variant of this precision, "fp32" or "bf16"; single precision where the processor cannot do the other."""
+    """The fastest variant of this precision, "fp32" or "bf16"; single precision where the processor lacks it."""
     names = instruction_sets()
     return names[-1] if precision == "bf16" else [name for name in names if name not in BF16][-1]
 
