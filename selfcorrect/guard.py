@@ -158,7 +158,7 @@ class Evidence:
     def add(self, rows: slice, *halves: tuple[Tensor, Tensor]) -> None:
         """Gather from rows of the halves of every candidate, each made with its own denoised half.
 
-        No half may have seen its witness but through the network's 20,303 weights.
+        No half may have seen its witness but through the network's few weights.
         """
         self._rows += rows.stop - rows.start
 

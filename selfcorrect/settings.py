@@ -13,6 +13,7 @@ _PAPER = "Back et al. 2022"
 _OURS = "not in the paper; scripts/bench/quality.py measures it"
 _WARM = "not in the paper; scripts/bench/shot.py measures it"
 _TRAINED = "the package's own are trained by scripts/train"
+_TRADE = "scripts/bench/tradeoff.py measures it"
 _MOST = 2**31 - 1
 """Of whole numbers: what every counter below holds."""
 
@@ -143,7 +144,9 @@ class Settings:
     window: int = _setting(19, "side of the cross-bilateral window, odd, at most 31", f"{_PAPER}, Sec. 4", least=1)
     taps_every: int = _setting(1, "in training, take one in so many of the window's pixels", _OURS, least=1)
     filters: int = _setting(16, "filters of each hidden convolution", f"{_PAPER}, Sec. 4", least=1, most=4096)
-    layers: int = _setting(9, "3x3 convolutions", f"{_PAPER}, Sec. 4", least=2, most=256)
+    layers: int = _setting(
+        9, "3x3 convolutions", f"{_PAPER}, Sec. 4; the other presets' five: {_TRADE}", least=2, most=256
+    )
     precision: str = _setting(
         "fp32",
         "of the convolutions: fp32, or bf16 where the processor has products or matrix tiles of it",
@@ -171,12 +174,7 @@ class Settings:
     rate_from_variance: bool = _setting(
         True, "multiply the rate by the root of the halves' variance", f"{_PAPER}, published code"
     )
-    schedule: str = _setting(
-        "constant",
-        "of the rate over the steps; averaged is constant, and the network is the mean of its last quarter",
-        _OURS,
-        choices=("constant", "cosine", "averaged"),
-    )
+    schedule: str = _setting("constant", "of the rate over the steps", _OURS, choices=("constant", "cosine"))
     gradient_limit: float = _setting(0.0, "largest norm of the gradient; 0 sets none", _OURS)
     adam_epsilon: float = _setting(1e-7, "Adam's epsilon", f"{_PAPER}, published code")
     loss_epsilon: float = _setting(0.01, "added to the squared radiance in the loss", f"{_PAPER}, Eq. 8", least=1e-12)
@@ -308,11 +306,12 @@ class Settings:
             precision="bf16",
             candidates="auto",
             frame_radius=2,
+            layers=5,
         )
         return {
             "balanced": balanced,
             "fast": replace(
-                balanced, steps=50, warm_steps=17, learning_rate=5e-3, warm_learning_rate=2.5e-3, candidates="none"
+                balanced, steps=75, warm_steps=25, learning_rate=3.3e-3, warm_learning_rate=1.7e-3, candidates="none"
             ),
             "best": replace(balanced, batch=16, visits=128, candidates="all"),
             "paper": cls(),

@@ -51,9 +51,9 @@ def steps_count(size: tuple[int, int], settings: Settings) -> int:
 def most_steps(size: tuple[int, int], settings: Settings) -> int:
     """How many steps a frame of this size can bear, at least 1.
 
-    20,303 weights can overfit the noise of a small frame, and that of the witness with it, which the guard then
-    takes for a gain: on 128×128 pixels 400 steps of four 64×64 patches, 400 visits to each pixel, made frames twice
-    worse, and the guard believed it. So the settings bound how often a pixel is visited.
+    The network can overfit the noise of a small frame, and that of the witness with it, which the guard then takes for
+    a gain: on 128×128 pixels 400 steps of four 64×64 patches, 400 visits to each pixel, made frames twice worse, and
+    the guard believed it. So the settings bound how often a pixel is visited.
     """
     if not settings.visits:
         return sys.maxsize
@@ -63,7 +63,7 @@ def most_steps(size: tuple[int, int], settings: Settings) -> int:
 def crops(size: tuple[int, int], settings: Settings, generator: torch.Generator) -> list[tuple[int, int, int, int]]:
     """Regions (top, left, bottom, right) of one size that patches are drawn from; empty for the whole image.
 
-    A network of 20,303 weights learns from a bounded number of pixels, however large the frame: steps on a frame of
+    A network of so few weights learns from a bounded number of pixels, however large the frame: steps on a frame of
     more than two million pixels get crops that hold as many, one in each cell of a grid, at random inside it.
     """
     side = 2 * settings.patch

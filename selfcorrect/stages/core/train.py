@@ -22,7 +22,6 @@ __all__ = ["Adam", "Limits", "Progress", "starting_losses", "train"]
 Progress = Callable[[int, int, float], None]
 
 _WARM_UP = 20  # steps over which the cosine schedule reaches its rate, but no more than a fifth of all
-_AVERAGED = 3.0  # the mean of the weights is that of about the last quarter of the steps
 _SHORTEST_ROUND = 0.5  # of the time that the steps took before: less is not worth beginning again for
 _LEAST_GAIN = 0.001  # of Eq. 8, most of which is noise that no network can take away
 _FETCHED_EVERY = 16  # steps; also how far a time budget or Ctrl-C may be overrun while the device catches up
@@ -120,36 +119,6 @@ def train(
     return losses
 
 
-class Average:
-    """The mean of a network's weights over its last steps, which needs not to know how many there will be.
-
-    Polynomial decay (Shamir and Zhang 2013, Stochastic Gradient Descent for Non-smooth Optimization, Sec. 4): after t
-    steps the new weights count for (η + 1) / (t + η).
-
-    Args:
-        network: whose weights are averaged, as they are before the first step.
-    """
-
-    def __init__(self, network: Network):
-        self._parameters = list(network.parameters())
-        self._mean = [p.detach().clone() for p in self._parameters]
-        self._steps = 0
-
-    @torch.no_grad()
-    def add(self) -> None:
-        """The weights after one more step."""
-        self._steps += 1
-        share = (_AVERAGED + 1) / (self._steps + _AVERAGED)
-        for mean, weights in zip(self._mean, self._parameters, strict=True):
-            mean.lerp_(weights, share)
-
-    @torch.no_grad()
-    def put(self) -> None:
-        """Give the network the mean."""
-        for mean, weights in zip(self._mean, self._parameters, strict=True):
-            weights.copy_(mean)
-
-
 class _Losses:
     """Eq. 8 before each step, left on the device and fetched every so many steps: to fetch is to wait for it.
 
@@ -211,7 +180,6 @@ def _round(
 
     recording = settings.cuda_graph and choose(None, [guides[0].planes], gpu=True) == "gpu"
     replayed = Replayed(step, guides, settings, CudaGraph(guides[0].planes.device)) if recording else None
-    average = Average(network) if settings.schedule == "averaged" else None
     began = time.perf_counter()
     for corners in batches(guides[0], settings, generator):
         done = max(losses.count / steps, (time.perf_counter() - began) / max(end - began, 1e-9)) if steps else 1.0
@@ -223,10 +191,6 @@ def _round(
         else:
             loss = step([patch for half in guides for patch in half.views(corners, size)], corners, now)
         losses.add(loss, steps)
-        if average is not None:
-            average.add()
-    if average is not None:
-        average.put()
     return losses.fetched(steps)
 
 
@@ -252,8 +216,7 @@ def starting_losses(network: Network, guides: tuple[Guides, Guides], settings: S
 
 
 def _schedule(step: int, steps: int, done: float, settings: Settings) -> float:
-    """Factor of the rate: constant as published; after a linear warm-up constant, or half a cosine ``done`` so far."""
+    """Factor of the rate: constant, or half a cosine over the part ``done`` of the way, after a linear warm-up."""
     if settings.schedule == "constant":
         return 1.0
-    warm = min(1.0, (step + 1) / min(_WARM_UP, max(steps // 5, 1)))
-    return warm if settings.schedule == "averaged" else warm * (1 + math.cos(math.pi * done)) / 2
+    return min(1.0, (step + 1) / min(_WARM_UP, max(steps // 5, 1))) * (1 + math.cos(math.pi * done)) / 2
