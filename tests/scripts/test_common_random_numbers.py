@@ -34,6 +34,12 @@ again = crn.render(scenes[True], 16, 3)
 assert np.array_equal(again, found["common"][3])
 pairs = zip(found["independent"], found["common"])
 found["poisson"] = np.stack([screened_poisson(y, z) for y, z in pairs])
+sampler = crn.CommonRandomNumbers()
+sampler.set_sample_count(8)
+found["numbers"] = np.empty((16, 4, 24))
+for seed, numbers in enumerate(found["numbers"]):
+    sampler.seed(seed, 24)
+    numbers[:] = [np.array(sampler.next_1d()) for _ in numbers]
 np.savez(sys.argv[1], **found)
 """
 
@@ -58,6 +64,12 @@ def test_errors_of_neighbours_correlate(renders: dict[str, np.ndarray]) -> None:
     assert neighbours(errors["common"]) > 0.5
     assert errors["common"].std() < 1.3 * errors["independent"].std()
     assert abs(errors["common"].mean()) < 4 * errors["common"].mean((1, 2, 3)).std() / np.sqrt(8)
+
+
+def test_pixels_share_numbers_and_seeds_do_not(renders: dict[str, np.ndarray]) -> None:
+    pixels = renders["numbers"].reshape(16, 4, 3, 8)  # by seed, dimension, pixel and sample
+    assert (pixels == pixels[:, :, :1]).all()
+    assert len(np.unique(pixels[:, :, 0])) == 16 * 4 * 8
 
 
 def test_screened_poisson_is_better_than_what_it_is_made_from(renders: dict[str, np.ndarray]) -> None:
