@@ -92,6 +92,9 @@ def _combined(y: Tensor, excess: Tensor, spread: Tensor, gammas: tuple[float, ..
             column = slice(tap % WINDOW, tap % WINDOW + width)
             change = e_c - e[(*at, column)]
             distance = (s_c - s[(*at, column)]) ** 2
+            weights: dict[float, Tensor] = {}
             for total, gamma in zip(sums, gammas, strict=True):
-                total[:, top : top + rows] += torch.exp(-gamma * distance) * change
+                half = weights.get(gamma / 2)  # half of the published γ are twice another: a square is cheaper
+                weights[gamma] = torch.exp(-gamma * distance) if half is None else half * half
+                total[:, top : top + rows].addcmul_(weights[gamma], change)
     return [y + total / WINDOW**2 for total in sums]
