@@ -69,6 +69,16 @@ def test_eqs_5_and_8_by_hand(kernel: str, crossed: bool) -> None:
         assert float(got[c]) == pytest.approx(sum(results) / 2, rel=EXACT, abs=0)
 
 
+@pytest.mark.parametrize("crossed", [False, True])
+def test_weights_do_not_tell_noise_from_its_mirror_image(crossed: bool) -> None:
+    """Why symmetric noise, however large, leaves no bias: over z and its mirror image at the truth, μ's errors cancel."""
+    truth, _, z = images(2)
+    mirrored = tuple(2 * truth - image for image in z)
+    both = [combine((truth,) * 4, images, samples=4, crossed=crossed, gammas=(0.5,))[0] for images in (z, mirrored)]
+    assert (both[0] - truth).square().mean() > 1e-4
+    torch.testing.assert_close((both[0] + both[1]) / 2, truth, rtol=EXACT, atol=0)
+
+
 def test_unbiased_and_better_than_either_baseline() -> None:
     """Squared bias from independent rounds, by products of two: what noise is left does not enter."""
     rounds = 16
