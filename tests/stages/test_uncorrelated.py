@@ -73,10 +73,10 @@ def test_eqs_5_and_8_by_hand(kernel: str, crossed: bool) -> None:
 
 @pytest.mark.parametrize("crossed", [False, True])
 def test_weights_do_not_tell_noise_from_its_mirror_image(crossed: bool) -> None:
-    """Why symmetric noise, however large, leaves no bias: over z and its mirror image at the truth, μ's errors cancel."""
+    """Why symmetric noise, however large, leaves no bias: the errors of μ over z and its mirror image cancel."""
     truth, _, z = images(2)
     mirrored = tuple(2 * truth - image for image in z)
-    both = [combine((truth,) * 4, images, samples=4, crossed=crossed, gammas=(0.5,))[0] for images in (z, mirrored)]
+    both = [combine((truth,) * 4, four, samples=4, crossed=crossed, gammas=(0.5,))[0] for four in (z, mirrored)]
     assert (both[0] - truth).square().mean() > 1e-4
     torch.testing.assert_close((both[0] + both[1]) / 2, truth, rtol=EXACT, atol=0)
 
