@@ -6,7 +6,8 @@ the same in neighbouring pixels, and cancels in their differences. Both are unbi
     μ_c = y_c + Σ_i k_i (Δz_ci − Δy_ci),   Δz_ci = z_c − z_i
 
 is unbiased for any weights k that are uncorrelated with what they weigh. The published weights look at the *difference*
-of two sub-averages of z, and weigh their *mean*: for equal, symmetric noise the two are uncorrelated.
+of two sub-averages of z, and weigh their *mean*: for equal, symmetric noise the two are uncorrelated. Of skewed noise,
+as of rare bright paths at few samples, a bias is left: pixels beside what such paths light come out too bright.
 """
 
 import torch
