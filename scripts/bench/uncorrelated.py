@@ -15,8 +15,8 @@ squared bias is the mean of d·d' over all pairs of *different* rounds, of d = �
 Behind ± are standard errors, of the bias from a jackknife over the rounds; z has no bias, and its row shows what is
 noise. The share in common is the variance of the mean error of a window over that of a pixel's: 1 where all pixels of a
 window err alike, 1/225 where their noise is independent. ``--symmetric`` adds the uncorrelated weighting of noise that
-is as large but not skewed: in every other round z is mirrored at ȳ, whose own noise is left in its bias. Needs the
-extra ``render`` and an LLVM library.
+is as large but not skewed: in every other round z is mirrored, at the mean y of the other rounds that are mirrored; of
+m such rounds that leaves −1/(m − 1)² of y's relMSE in the squared bias. Needs the extra ``render`` and an LLVM library.
 """
 
 import argparse
@@ -144,14 +144,14 @@ def deep_combined(network: DeepCombiner, y: Image, z: Image, features: Image) ->
 
 def add_symmetric(rounds: list[dict[str, Image]], place: Place, options: argparse.Namespace) -> None:
     """Add to each round the uncorrelated weighting, of every other one with z's noise turned round."""
-    mean = np.mean([made["y"] for made in rounds], 0)
+    others = np.sum([made["y"] for made in rounds[1::2]], 0)
     for number, made in enumerate(rounds):
         image = made["uncorrelated"]
         if number % 2:
             renders = np.load(_file(place, number, options))
             y, z = (torch.from_numpy(renders[f"renders {kind}"]).unbind() for kind in "yz")
-            turned = tuple(2 * torch.from_numpy(mean) - one for one in z)
-            image = combine(y, turned, samples=options.spp)[0].numpy()
+            middle = torch.from_numpy((others - made["y"]) / (len(rounds) // 2 - 1))
+            image = combine(y, tuple(2 * middle - one for one in z), samples=options.spp)[0].numpy()
         made["uncorrelated, noise of z made symmetric"] = image
 
 
