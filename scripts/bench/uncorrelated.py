@@ -2,6 +2,7 @@
 
     .venv/bin/python scripts/bench/uncorrelated.py ROUNDS [SCENES/NAME/scene.xml ...] [--rounds 100] [--spp 8]
     .venv/bin/python scripts/bench/uncorrelated.py ROUNDS SCENE.xml --of 128         # the whole field of view, small
+    .venv/bin/python scripts/bench/uncorrelated.py ROUNDS SCENE.xml --symmetric      # is the bias due to skewed noise?
 
 Of each scene (the Cornell box, where none is named) the 128×128 pixels in the middle of a frame ``--of`` so many pixels
 wide: what common random numbers are worth depends on how much of the scene a window of 15×15 pixels sees. Every round
@@ -13,7 +14,9 @@ round's μ is |μ − ȳ|² − s²/(n − 1) with the mean ȳ and the sample va
 squared bias is the mean of d·d' over all pairs of *different* rounds, of d = μ − y. Both are over mean_rgb(ȳ)² + 0.01.
 Behind ± are standard errors, of the bias from a jackknife over the rounds; z has no bias, and its row shows what is
 noise. The share in common is the variance of the mean error of a window over that of a pixel's: 1 where all pixels of a
-window err alike, 1/225 where their noise is independent. Needs the extra ``render`` and an LLVM library.
+window err alike, 1/225 where their noise is independent. ``--symmetric`` adds the uncorrelated weighting of noise that
+is as large but not skewed: in every other round z is mirrored, at the mean y of the other rounds that are mirrored; of
+m such rounds that leaves −1/(m − 1)² of y's relMSE in the squared bias. Needs the extra ``render`` and an LLVM library.
 """
 
 import argparse
@@ -61,6 +64,8 @@ def main() -> None:
     for path in options.scenes or [None]:
         place = opened(crn, path, options)
         rounds = [round_of(crn, place, number, network, options) for number in range(options.rounds)]
+        if options.symmetric:
+            add_symmetric(rounds, place, options)
         print(f"\n{place.name}, {options.rounds} rounds, 4 x {options.spp} spp of each kind, of {options.of} pixels")
         print("\n".join(table(rounds)), flush=True)
 
@@ -96,7 +101,7 @@ def round_of(
     crn: Any, place: Place, number: int, network: DeepCombiner, options: argparse.Namespace
 ) -> dict[str, Image]:
     """The images of a round by name; what its file lacks is made."""
-    file = options.out / place.name / f"{number:05}.npz"
+    file = _file(place, number, options)
     found = dict(np.load(file)) if file.exists() else {}
     if not found:
         for kind, scene, first in (("y", place.scenes[0], 8 * number), ("z", place.scenes[1], 8 * number + 4)):
@@ -135,6 +140,19 @@ def deep_combined(network: DeepCombiner, y: Image, z: Image, features: Image) ->
     planes = feature_planes((y.shape[0], y.shape[1]), normal=normal, albedo=albedo, depth=depth)
     scale = 1 / float(np.sqrt(z.clip(min=0).mean(-1)).mean() ** 2)
     return combine_whole(network, (torch.from_numpy(y),), (torch.from_numpy(z),), planes, scale=scale).numpy()
+
+
+def add_symmetric(rounds: list[dict[str, Image]], place: Place, options: argparse.Namespace) -> None:
+    """Add to each round the uncorrelated weighting, of every other one with z's noise turned round."""
+    others = np.sum([made["y"] for made in rounds[1::2]], 0)
+    for number, made in enumerate(rounds):
+        image = made["uncorrelated"]
+        if number % 2:
+            renders = np.load(_file(place, number, options))
+            y, z = (torch.from_numpy(renders[f"renders {kind}"]).unbind() for kind in "yz")
+            middle = torch.from_numpy((others - made["y"]) / (len(rounds) // 2 - 1))
+            image = combine(y, tuple(2 * middle - one for one in z), samples=options.spp)[0].numpy()
+        made["uncorrelated, noise of z made symmetric"] = image
 
 
 def table(rounds: list[dict[str, Image]]) -> list[str]:
@@ -177,6 +195,11 @@ def in_common(images: Image, weight: Image) -> float:
     return float(windows.square().mean() / errors.square().mean())
 
 
+def _file(place: Place, number: int, options: argparse.Namespace) -> Path:
+    path: Path = options.out / place.name / f"{number:05}.npz"
+    return path
+
+
 def _saved(file: Path, arrays: dict[str, Image]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     temporary = file.with_name(f".{os.getpid()}.{file.name}")
@@ -193,6 +216,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--size", type=int, default=128, help="pixels of the piece (default: %(default)s)")
     parser.add_argument("--of", type=int, default=1024, help="pixels of the frame that it is cut out of")
     parser.add_argument("--spp", type=int, default=8, help="of each of the eight renders (default: %(default)s)")
+    parser.add_argument("--symmetric", action="store_true", help="a further row, of noise without skew")
     return parser.parse_args()
 
 

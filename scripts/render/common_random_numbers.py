@@ -13,13 +13,13 @@ import numpy as np
 
 mi.set_variant("llvm_ad_rgb")
 
-_SEED = 0x1234567  # any number will do
-
 
 class CommonRandomNumbers(mi.Sampler):
     """Sample k of every pixel draws the same numbers.
 
-    ``PCG32(size, …)`` gives every lane a stream of its own, so its state and increment are gathered by sample index.
+    Seed and k are hashed together, as Mitsuba's own sampler hashes seed and lane: streams of PCG32 that start at
+    consecutive states repeat each other's first numbers three seeds apart. Samples count down from 2³², where lanes are
+    not: no pixel of an independent render of the same seed has these numbers.
     """
 
     def __init__(self, properties: Any = None):
@@ -41,12 +41,11 @@ class CommonRandomNumbers(mi.Sampler):
     def seed(self, seed: int, wavefront_size: int = 0xFFFFFFFF) -> None:
         """Start the streams: one for each sample of a pixel, the same in all pixels."""
         super().seed(seed, wavefront_size)
-        count = self.sample_count()
-        lane = mi.UInt32(np.arange(wavefront_size, dtype=np.uint32) % count)
-        streams = mi.PCG32(count, initstate=mi.UInt64(seed) + _SEED)
-        self.random = mi.PCG32()
-        self.random.state = drjit.gather(mi.UInt64, streams.state, lane)
-        self.random.inc = drjit.gather(mi.UInt64, streams.inc, lane)
+        sample = drjit.arange(mi.UInt32, wavefront_size) % self.sample_count()
+        number = mi.UInt32(seed)
+        drjit.make_opaque(number)  # a kernel compiled once for all seeds
+        state, sequence = mi.sample_tea_32(number, ~sample)
+        self.random.seed(mi.UInt64(state), mi.UInt64(sequence))
 
     def next_1d(self, active: Any = True) -> Any:
         """The next number of every lane."""

@@ -1,6 +1,8 @@
 """Uncorrelated weighting: the equations by hand, bias and error in simulation, and the command."""
 
+import itertools
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +69,37 @@ def test_eqs_5_and_8_by_hand(kernel: str, crossed: bool) -> None:
                     total = total + k / 225 * (dz - dy)
             results.append(float(total))
         assert float(got[c]) == pytest.approx(sum(results) / 2, rel=EXACT, abs=0)
+
+
+@pytest.mark.parametrize("crossed", [False, True])
+def test_weights_do_not_tell_noise_from_its_mirror_image(crossed: bool) -> None:
+    """Why symmetric noise, however large, leaves no bias: the errors of μ over z and its mirror image cancel."""
+    truth, _, z = images(2)
+    mirrored = tuple(2 * truth - image for image in z)
+    both = [combine((truth,) * 4, four, samples=4, crossed=crossed, gammas=(0.5,))[0] for four in (z, mirrored)]
+    assert (both[0] - truth).square().mean() > 1e-4
+    torch.testing.assert_close((both[0] + both[1]) / 2, truth, rtol=EXACT, atol=0)
+
+
+@pytest.mark.parametrize("chance", [0.125, 0.5, 0.75])
+def test_skewed_noise_leaves_the_bias_of_the_equations(chance: float) -> None:
+    """A dark wall beside a lamp of radiance m that an image of z meets with a chance p, as m/p, or does not, as 0.
+
+    Weights of a large γ are 1 where both sub-images agree on the lamp, and else 0. Of a share f of lamp in its window a
+    pixel of the wall is thus off by −f Cov(k, z̄) = f m (1 − p) (1 − 2p): brighter for rare paths, right at p = ½.
+    """
+    height, width, lamp = 3, 40, 2.0
+    truth = torch.zeros(height, width, 1, dtype=torch.float64)
+    truth[:, width // 2 :] = lamp
+    expected = torch.zeros_like(truth)
+    for met in itertools.product((0, 1), repeat=4):
+        probability = math.prod(chance if hit else 1 - chance for hit in met)
+        z = tuple(truth * (hit / chance) for hit in met)
+        expected += probability * combine((truth,) * 4, z, samples=8, gammas=(1e3,))[0]
+    share = (truth[0, :, 0].index_select(0, reflect(-7, width + 7, width)).unfold(0, WINDOW, 1) > 0).double().mean(-1)
+    wall = slice(0, width // 2)
+    bias = share[wall] * lamp * (1 - chance) * (1 - 2 * chance)
+    torch.testing.assert_close(expected[1, wall, 0], bias, rtol=EXACT, atol=EXACT)
 
 
 def test_unbiased_and_better_than_either_baseline() -> None:
