@@ -2,19 +2,30 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers.synthetic import BALANCED, boxed, corrected, noisy, plain, scene, swapped, twice
-from helpers.tolerances import EXPOSURE, EXPOSURE_BLEND, EXPOSURE_OF_TWO, EXPOSURE_TINY, EXPOSURE_TINY_BLEND, SWAPPED
+from helpers.tolerances import (
+    EXPOSURE,
+    EXPOSURE_BF16,
+    EXPOSURE_BF16_BLEND,
+    EXPOSURE_BLEND,
+    EXPOSURE_OF_TWO,
+    EXPOSURE_TINY,
+    EXPOSURE_TINY_BLEND,
+    SWAPPED,
+)
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from selfcorrect import Frame, Settings
 from selfcorrect.errors import FrameError
+from selfcorrect.kernel.convolution import cpu
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -25,11 +36,12 @@ FEW = settings(max_examples=12, deadline=None, database=None, derandomize=True, 
 # --- Exposure -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("deviation", [0.3, 2.0])
 @pytest.mark.parametrize("factor", [1e-4, 1e-2, 1e2, 1e4, 2.0**-13, 2.0**13, 1e-40, 1e-30, 1e20, 1e36])
-def test_exposure_changes_nothing_else(factor: float, deviation: float) -> None:
+def test_exposure_changes_nothing_else(factor: float, deviation: float, precision: str) -> None:
     frame = boxed(noisy(scene(), deviation), albedo=twice(scene()))
-    assert_same_but_for(factor, frame, BALANCED)
+    assert_same_but_for(factor, frame, replace(BALANCED, precision=precision))
 
 
 def assert_same_but_for(factor: float, frame: Frame, preset: Settings) -> None:
@@ -53,6 +65,8 @@ def assert_same_but_for(factor: float, frame: Frame, preset: Settings) -> None:
     expected, got = corrected(through(kept), preset), corrected(through(times), preset)
     image = plain(expected.image)
     bound, of_blend = (EXPOSURE_TINY, EXPOSURE_TINY_BLEND) if factor < 1e-20 else (EXPOSURE, EXPOSURE_BLEND)
+    if cpu.best_instruction_set(preset.precision) in cpu.BF16:
+        bound, of_blend = EXPOSURE_BF16, EXPOSURE_BF16_BLEND
     if math.frexp(factor)[0] == 0.5:
         bound, of_blend = EXPOSURE_OF_TWO, EXPOSURE_OF_TWO
     assert np.abs(plain(got.image) / factor - image).max() < bound * image.mean()

@@ -14,6 +14,9 @@ EXPOSURE_BLEND = 5e-6  # 6.6e-7, the guard's blend from 0 to 1
 # Factors below 1e-20, where float32 keeps few digits of the frame or of its products.
 EXPOSURE_TINY = 1e-3  # 3.4e-4
 EXPOSURE_TINY_BLEND = 5e-4  # 1.1e-4
+# Where the convolutions are in bfloat16, an activation may be rounded the other way; factors 1e-40 … 1e36.
+EXPOSURE_BF16 = 2e-3  # 3.6e-4
+EXPOSURE_BF16_BLEND = 2e-4  # 2.5e-5
 SWAPPED = 4e-6  # 5.0e-7 of the mean: half a and half b exchanged
 
 # Eq. 8 through network and kernel in float32 against float64: relative, the gradient to its largest entry.
