@@ -26,7 +26,7 @@ def build(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def test_the_compiler_that_cmake_calls(
     build: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
 ) -> None:
-    """Names with spaces stay one; a bundle, at which Zig's linker crashes, becomes a library for Python to load; no libdl."""
+    """Names with spaces stay one; no libdl; a bundle, at which Zig's linker crashes, becomes a library as well."""
     told = tmp_path / "told"
     told.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
     told.chmod(0o755)
