@@ -29,12 +29,10 @@ def _setting(
     least: float = 0,
     unit: str = "",
     most: float | None = None,
-    everyday: bool = False,
 ) -> Any:
-    """A field with what the command's flag and the range check need; ``everyday``: no expert's, short help lists it."""
+    """A field with what the command's flag and the range check need."""
     most = most or (_MOST if isinstance(default, int) else sys.float_info.max)
     metadata = {"help": help_, "source": source, "choices": choices, "least": least, "most": most, "unit": unit}
-    metadata["everyday"] = everyday
     return field(default=default, metadata=metadata)
 
 
@@ -220,14 +218,12 @@ class Settings:
         0,
         "of a shot: how many frames on either side give their samples to the candidate history; 0 takes none",
         _WARM,
-        everyday=True,
     )
     time_budget: float = _setting(
         0.0,
         "seconds for the whole frame: training takes what the rest leaves; 0 sets none",
         "the user's",
         unit="s",
-        everyday=True,
     )
     seed: int = _setting(
         0, "of the network's first weights and the order of the patches", "any number will do", most=2**63 - 1

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from selfcorrect import Frame, Settings, cli, correct, metrics
 from selfcorrect.cli import runner
-from selfcorrect.cli.flags import add_run_flags
+from selfcorrect.cli.flags import add_run_flags, add_written
 from selfcorrect.errors import DeviceError, MissingPackageError
 from selfcorrect.frame import Half
 from selfcorrect.kernel import cross_bilateral as kernel
@@ -194,6 +194,7 @@ def test_without_triton(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_stays_on_the_cpu_is_told(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     parser = argparse.ArgumentParser()
+    add_written(parser)
     add_run_flags(parser)
     monkeypatch.setattr(runner, "_use_machine", lambda options: None)
     flags = ["--device", "cuda", "--stages", "regression,core", "--denoiser", "nlm"]

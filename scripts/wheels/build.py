@@ -37,13 +37,15 @@ TARGETS = {
     "macos-arm64": Target("aarch64-macos.11.0", "Darwin", "arm64", "macosx_11_0_arm64"),
 }
 # nanobind hands Apple's linker a file of the names that Python brings at run time; Zig's own takes no such file. It
-# also crashes where it is asked for a bundle: Python loads a library as well.
+# also crashes where it is asked for a bundle: Python loads a library as well. CMake takes libdl for needed on Windows,
+# since this machine's Python needs it; where there is one, Zig links it unasked.
 OWN_LINKER = """
 for argument do
     shift
     case "$argument" in
         -Wl,@*) argument=-Wl,-undefined,dynamic_lookup ;;
         -bundle) argument=-dynamiclib ;;
+        -ldl) continue ;;
     esac
     set -- "$@" "$argument"
 done

@@ -25,8 +25,6 @@ _ERROR = "estimated relMSE over that of the denoised image"
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
     halves.check(options)
-    if options.diagnostics:
-        raise SettingsError("expected no --diagnostics with bench, which writes no image, but got one")
     if options.guard is False:
         raise SettingsError("expected the guard, whose estimate bench compares, but got --no-guard")
     runner = Runner(options, given=options.denoised_a is not None and options.previous is None)

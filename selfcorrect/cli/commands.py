@@ -52,7 +52,8 @@ def _frame(commands: Any) -> None:
     flags.add_report(parser)
     flags.add_aovs(parser)
     flags.add_layers(parser)
-    flags.add_run_flags(parser)
+    flags.add_written(parser)
+    flags.add_run_flags(parser, everyday=("time_budget",))
     parser.set_defaults(run=_later("frame", _check_frame))
 
 
@@ -78,7 +79,8 @@ def _sequence(commands: Any) -> None:
     flags.add_report(parser)
     flags.add_aovs(parser)
     flags.add_layers(parser)
-    flags.add_run_flags(parser)
+    flags.add_written(parser)
+    flags.add_run_flags(parser, everyday=("frame_radius", "time_budget"))
     parser.set_defaults(run=_later("sequence", flags.check))
 
 
@@ -103,7 +105,7 @@ def _bench(commands: Any) -> None:
     parser.add_argument("--plot", metavar="OUT.png", help="seconds against error (needs the extra bench)")
     flags.add_report(parser)
     flags.add_run_flags(parser)
-    parser.set_defaults(run=_later("bench", flags.check))
+    parser.set_defaults(run=_later("bench", flags.check), diagnostics=[])  # it writes no image
 
 
 def _inspect(commands: Any) -> None:
@@ -164,5 +166,6 @@ def _combine(commands: Any) -> None:
 def _demo(commands: Any) -> None:
     parser = commands.add_parser("demo", help="correct the packaged frame and show what was gained")
     parser.add_argument("-o", "--output", metavar="DIR", help="keep the images here")
-    flags.add_run_flags(parser)
+    flags.add_written(parser)
+    flags.add_run_flags(parser, everyday=("time_budget",))
     parser.set_defaults(run=_later("demo", flags.check))

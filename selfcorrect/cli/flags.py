@@ -2,6 +2,7 @@
 
 import argparse
 import tomllib
+from collections.abc import Collection
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ __all__ = [
     "add_report",
     "add_run_flags",
     "add_settings",
+    "add_written",
     "check",
     "denoised",
     "extra_files",
@@ -85,13 +87,8 @@ def add_extra(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(extra.flag, nargs=len(extra.files), metavar=extra.files, help=Expert(extra.help))
 
 
-def add_run_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags that every command with a correction takes. A flag is one row; help as :class:`Expert` hides it."""
-    parser.add_argument("--denoiser", metavar="NAME", help=f"one of {' | '.join(denoisers.names())}")
-    add_preset(parser)
-    parser.add_argument("--device", default="cpu", help="torch device: cpu (the default), cuda, …")
-    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads, by default all")
-    parser.add_argument("--map", action="append", default=[], metavar="ROLE=CHANNEL", help="albedo=MyAlbedo, …")
+def add_written(parser: argparse.ArgumentParser) -> None:
+    """What goes into the written image beside the corrected colour."""
     parser.add_argument(
         "--diagnostics",
         type=_diagnostics,
@@ -106,8 +103,20 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         help="keep every channel but the picture as half a has it; by default those that are linear in the samples "
         "become the mean of both halves",
     )
+
+
+def add_run_flags(parser: argparse.ArgumentParser, *, everyday: Collection[str] = ()) -> None:
+    """The flags that every command with a correction takes. A flag is one row; help as :class:`Expert` hides it.
+
+    ``everyday``: settings whose own flags the short help lists.
+    """
+    parser.add_argument("--denoiser", metavar="NAME", help=f"one of {' | '.join(denoisers.names())}")
+    add_preset(parser)
+    parser.add_argument("--device", default="cpu", help="torch device: cpu (the default), cuda, …")
+    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads, by default all")
+    parser.add_argument("--map", action="append", default=[], metavar="ROLE=CHANNEL", help="albedo=MyAlbedo, …")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    add_settings(parser)
+    add_settings(parser, everyday)
     add_help_all(parser)
 
 
@@ -117,8 +126,8 @@ def add_preset(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", default=Settings.default(), metavar="NAME", help=" | ".join(names))
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Single settings: from a file, by name, and each by a flag of its own, most of them for experts."""
+def add_settings(parser: argparse.ArgumentParser, everyday: Collection[str] = ()) -> None:
+    """Settings: from a file, by name, and each by a flag of its own, for experts where it is not ``everyday``."""
     parser.add_argument(
         "--settings", dest="settings_file", metavar="FILE.toml", help="settings, a line NAME = VALUE for each"
     )
@@ -131,7 +140,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         help="a setting; `selfcorrect settings` lists them",
     )
     for f in fields(Settings):
-        shown: type[str] = str if f.metadata["everyday"] else Expert
+        shown: type[str] = str if f.name in everyday else Expert
         how: dict[str, Any] = {"type": type(f.default), "metavar": "|".join(f.metadata["choices"]) or "N"}
         if f.metadata["unit"]:
             how = {"type": seconds, "metavar": "10s"} if f.metadata["unit"] == "s" else {"metavar": "FILE"}

@@ -80,7 +80,7 @@ class Runner:
     """Corrects frames as the flags say, and tells of it.
 
     Args:
-        options: what the flags of :func:`selfcorrect.cli.flags.add_run_flags` gave.
+        options: what the flags of ``add_run_flags`` and ``add_written`` in :mod:`selfcorrect.cli.flags` gave.
         given: denoised halves are given, so that no denoiser is needed.
         scratch: bytes that the denoiser may take beside its images, where it can be told.
         layers: how many view layers a frame has that share its time budget.

@@ -55,6 +55,22 @@ def test_all_help_has_every_flag(command: str, capsys: pytest.CaptureFixture[str
     assert "--help-all" in told(capsys, command, "--help")
 
 
+def test_short_help_lists_a_flag_where_it_does_something(capsys: pytest.CaptureFixture[str]) -> None:
+    """Frames beside one are a shot's; a budget is a frame's; bench writes no image."""
+    commands = {
+        flag: {command for command in (*RUNS, "settings") if flag in told(capsys, command, "--help").split()}
+        for flag in ("--frame-radius", "--time-budget", "--diagnostics", "--pass-through")
+    }
+    writing = {"frame", "sequence", "demo"}
+    assert commands == {
+        "--frame-radius": {"sequence"},
+        "--time-budget": writing,
+        "--diagnostics": writing,
+        "--pass-through": writing,
+    }
+    assert "unrecognized arguments: --diagnostics" in refused("bench", "a.exr", "b.exr", "--diagnostics", "error")
+
+
 def test_every_flag_says_what_it_does() -> None:
     (commands,) = (action for action in cli._parser()._actions if action.choices)
     parsers = dict(commands.choices or {})

@@ -121,6 +121,11 @@ def pixel(driver: Any, x: int, y: int, size: tuple[int, int] = SIZE) -> Any:
     return screen[round(top + (y + 0.5) * zoom), round(left + (x + 0.5) * zoom)]
 
 
+def picture(stage: Any) -> Any:
+    """A whole stage, as it is on the screen."""
+    return np.asarray(Image.open(io.BytesIO(stage.screenshot_as_png)).convert("RGB"), np.int64)
+
+
 def press(driver: Any, *keys: str) -> None:
     ActionChains(driver).send_keys(*keys).perform()
 
@@ -205,8 +210,8 @@ class TestFrame:
         stages[0].send_keys(Keys.ARROW_RIGHT)
         for stage, image in zip(stages, images().values(), strict=False):
             driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", stage)
-            picture = np.asarray(Image.open(io.BytesIO(stage.screenshot_as_png)).convert("RGB"), np.int64)
-            seen = picture[picture.shape[0] // 2 + 5, picture.shape[1] // 2 + 5]
+            screen = picture(stage)
+            seen = screen[screen.shape[0] // 2 + 5, screen.shape[1] // 2 + 5]
             caption = driver.find_element(By.CSS_SELECTOR, ".inspector caption").text
             x, y = (int(word.strip(",")) for word in caption.split()[1:3])
             np.testing.assert_array_equal(seen, shown(image[y, x]))
@@ -239,12 +244,17 @@ def test_a_dark_frame_is_exposed(opened: Any) -> None:
     assert float(driver.find_element(By.CSS_SELECTOR, "input[type=range]").get_property("value")) > 4
 
 
-def test_what_was_changed_most_in_every_pixel(opened: Any) -> None:
-    """Of a frame that has to be reduced."""
+def reduced_page() -> tuple[str, dict[str, Any]]:
+    """A frame that has to be reduced, changed in a corner, and its images."""
     denoised = np.random.default_rng(9).gamma(2.0, 0.2, (800, 1300, 3)).astype(np.float16)
     large = {"denoised": denoised, "corrected": denoised.copy()}
     large["corrected"][10:20, 330:340] = 9
-    driver = opened(report.frame_page(large, {}, FACTS))
+    return report.frame_page(large, {}, FACTS), large
+
+
+def test_what_was_changed_most_in_every_pixel(opened: Any) -> None:
+    text, large = reduced_page()
+    driver = opened(text)
     whole, detail = driver.find_elements(By.CSS_SELECTOR, "[aria-label=Region] button")
     assert whole.get_attribute("aria-pressed") == "true"
     detail.click()
@@ -252,6 +262,24 @@ def test_what_was_changed_most_in_every_pixel(opened: Any) -> None:
     driver.find_element(By.CSS_SELECTOR, "[data-layer=corrected]").click()
     np.testing.assert_array_equal(pixel(driver, 10, 10, (320, 320)), [255, 255, 255])
     np.testing.assert_array_equal(pixel(driver, 200, 100, (320, 320)), shown(large["corrected"][100, 520]))
+
+
+def test_the_region_asked_for_last_is_shown(opened: Any) -> None:
+    """Though the other one, which had to be unpacked first, was asked for a moment before."""
+    driver = opened(reduced_page()[0])
+    buttons = driver.find_elements(By.CSS_SELECTOR, "[aria-label=Region] button")
+    stage = driver.find_element(By.CSS_SELECTOR, ".stage")
+    pressed, whole = [button.get_attribute("aria-pressed") for button in buttons], picture(stage)
+    unpacked = driver.execute_async_script(
+        "const [[whole, detail], done] = arguments, reads = [], read = Response.prototype.arrayBuffer;"
+        "Response.prototype.arrayBuffer = function () { const r = read.call(this); reads.push(r); return r; };"
+        "detail.click(); whole.click();"
+        "Promise.all(reads).then(() => setTimeout(done, 0, reads.length));",
+        buttons,
+    )
+    assert unpacked == 2
+    assert [button.get_attribute("aria-pressed") for button in buttons] == pressed
+    np.testing.assert_array_equal(picture(stage), whole)
 
 
 def test_a_frame_with_nan_opens(opened: Any) -> None:

@@ -26,7 +26,7 @@ def build(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def test_the_compiler_that_cmake_calls(
     build: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
 ) -> None:
-    """Names with spaces stay one; a bundle, at which Zig's linker crashes, becomes a library for Python to load."""
+    """Names with spaces stay one; no libdl; a bundle, at which Zig's linker crashes, becomes a library as well."""
     told = tmp_path / "told"
     told.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
     told.chmod(0o755)
@@ -35,7 +35,7 @@ def test_the_compiler_that_cmake_calls(
     toolchain = build.toolchain_of(target, tmp_path)
     for tool in ("cxx", "ar", "ranlib"):
         assert f"{tmp_path}/zig-{tool}" in toolchain
-    given = ["-O3", "-bundle", "-Wl,@names.sym", "-o", "a b.so", "a b.o"]
+    given = ["-O3", "-bundle", "-Wl,@names.sym", "-ldl", "-o", "a b.so", "a b.o"]
     seen = subprocess.run([tmp_path / "zig-cxx", *given], capture_output=True, text=True, check=True).stdout.split("\n")
     assert seen[:5] == ["-m", "ziglang", "c++", "-target", target.triple]
     assert seen[5:-1] == ["-O3", "-dynamiclib", "-Wl,-undefined,dynamic_lookup", "-o", "a b.so", "a b.o"]
