@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from selfcorrect.frame import Half
+from selfcorrect.stages.bilateral_combiner import BilateralCombiner
 from selfcorrect.stages.deep_combiner import DeepCombiner
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
 from selfcorrect.stages.layers import tau
@@ -154,6 +155,14 @@ class CombinerTask:
         return found
 
 
+class BilateralCombinerTask(CombinerTask):
+    """The same for the combiner with bilateral weights."""
+
+    def build(self) -> nn.Module:
+        """See :class:`Task`."""
+        return BilateralCombiner(**self.architecture, seed=self.seed)
+
+
 class JamesSteinTask:
     """Two inputs of equal noise whose mean is X; Eq. 14 to first order around the inputs denoised.
 
@@ -290,6 +299,7 @@ def _image(planes: Tensor) -> Tensor:
 TASKS: dict[str, tuple[Callable[[dict[str, Any], int, int], Task], dict[str, Any]]] = {
     "denoiser": (DenoiserTask, {}),
     "james-stein": (JamesSteinTask, {}),
+    "bilateral-combiner": (BilateralCombinerTask, {}),
     "deep-combiner": (CombinerTask, {"buffers": 1}),
     "deep-combiner-4": (CombinerTask, {"buffers": 4}),
 }
