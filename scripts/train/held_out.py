@@ -6,10 +6,12 @@
     done
     .venv/bin/python scripts/train/held_out.py measure FRAMES --weights RUNS --out TABLE.csv [--stages core --spp 64]
     .venv/bin/python scripts/train/held_out.py table --out TABLE.csv
+    .venv/bin/python scripts/train/held_out.py curve --weights RUNS --out CURVE.png
 
 measure: a row for each frame, denoiser and chain of stages, written at once; rows that the file has are not measured
 again. A scene's weights are RUNS/SCENE.safetensors. Everything is unguarded unless a stage is the core. table: the
-error over the denoiser's, geometric mean (worst), and the median of the mean radiance over the reference's.
+error over the denoiser's, geometric mean (worst), and the median of the mean radiance over the reference's. curve: the
+last validation of runs in folders RUNS/SCENE-VIEWS, trained with ``--hold-out SCENE --at-most VIEWS``.
 """
 
 import argparse
@@ -17,8 +19,11 @@ import csv
 import sys
 from pathlib import Path
 
+import matplotlib as mpl
+import matplotlib.pyplot as plt
 import torch
 from evaluate import FRAME_SPP, geometric, rows
+from train import publish
 
 import denoisers
 from selfcorrect import Frame, Settings, correct, metrics
@@ -27,6 +32,8 @@ from selfcorrect.frame import mean
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
 
 from quality import load as load_frame
+
+mpl.use("Agg")
 
 DENOISERS = ("joint-bilateral", "nfor", "oidn")
 COLUMNS = ("frame", "spp", "denoiser", "stages", "relmse", "radiance")
@@ -41,11 +48,12 @@ def main(arguments: list[str] | None = None) -> None:
         for name in sorted({path.name.split("_")[0] for path in options.frames.glob("*_ref_A.exr")}):
             for spp in options.spp:
                 for denoiser in options.denoisers:
-                    wanted = [each for each in (ALONE, *options.stages)]
-                    measure(
-                        name, spp, denoiser, [w for w in wanted if (name, str(spp), denoiser, w) not in done], options
-                    )
-    print(table(rows(options.out)))
+                    chains = [c for c in (ALONE, *options.stages) if (name, str(spp), denoiser, c) not in done]
+                    measure(name, spp, denoiser, chains, options)
+    if options.verb == "curve":
+        draw_curve(options.weights, options.out)
+    else:
+        print(table(rows(options.out)))
 
 
 def measure(name: str, spp: int, denoiser: str, chains: list[str], options: argparse.Namespace) -> None:
@@ -92,9 +100,28 @@ def table(measured: list[dict[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def draw_curve(runs: Path, path: Path) -> None:
+    """Error over the denoised images' of each held-out scene, against the number of views trained on."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    for folder in sorted(runs.glob("*-[0-9]*")):
+        scene, _, views = folder.name.rpartition("-")
+        if not (folder / "validation.csv").exists():
+            continue
+        last = rows(folder / "validation.csv")[-1]
+        found.setdefault(scene, []).append((int(views), float(last["to_baseline"])))
+        print(folder.name, last["to_baseline"])
+    figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
+    for scene, points in found.items():
+        axes.plot(*zip(*sorted(points), strict=True), "o-", label=f"{scene}, held out")
+    axes.axhline(1, color="gray", linewidth=0.8)
+    axes.set(xlabel="views trained on", ylabel="error over the denoised images'", xscale="log")
+    axes.legend()
+    publish(path, lambda temporary: figure.savefig(temporary, dpi=100))
+
+
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("verb", choices=["measure", "table"])
+    parser.add_argument("verb", choices=["measure", "table", "curve"])
     parser.add_argument("frames", type=Path, nargs="?", metavar="FRAMES")
     parser.add_argument("--weights", type=Path, metavar="RUNS", help="with a file SCENE.safetensors for each")
     parser.add_argument("--out", type=Path, required=True)
