@@ -18,7 +18,6 @@ from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
 __all__ = [
     "PACKAGED",
-    "WEAK",
     "Denoise",
     "DualPlugin",
     "Plugin",
@@ -35,9 +34,6 @@ if TYPE_CHECKING:
 
 PACKAGED = Path(__file__).resolve().parent / "weights" / "denoiser.onnx"
 """The project's own model: ``onnx`` without a path."""
-
-WEAK = ("joint-bilateral", "nlm", "nfor")
-"""Those that the deep combiner gains most on; it was trained on each of them."""
 
 _MOST_THREADS = 1024
 

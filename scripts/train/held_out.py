@@ -64,7 +64,7 @@ def measure(name: str, spp: int, denoiser: str, chains: list[str], options: argp
     judges = [torch.from_numpy(reference) for reference in references]
     frame = frame.denoise(denoisers.create(denoiser, threads=options.threads))
     for stages in chains:
-        image = image_of(frame, stages, options.weights / f"{name}.safetensors")
+        image = image_of(frame, stages, options.weights / f"{name}.safetensors", options.preset)
         error, radiance = metrics.relmse(image, *judges), metrics.mean_radiance_ratio(image, mean(judges[:2]))
         row = (name, spp, denoiser, stages, f"{error:.6g}", f"{radiance:.5g}")
         new = not options.out.exists()
@@ -73,14 +73,14 @@ def measure(name: str, spp: int, denoiser: str, chains: list[str], options: argp
         print(*row, sep="  ", flush=True)
 
 
-def image_of(frame: Frame, stages: str, weights: Path) -> torch.Tensor:
+def image_of(frame: Frame, stages: str, weights: Path, preset: str) -> torch.Tensor:
     """What a chain of stages makes of a frame."""
     image: torch.Tensor
     if stages == ALONE:
         assert isinstance(frame.denoised_full, torch.Tensor)  # denoise() makes one
         return frame.denoised_full
     settings = {"guard": "core" in stages, "candidates": "none", "combiner_weights": str(weights)}
-    image = correct(frame, Settings.preset("balanced", stages=stages, **settings)).image
+    image = correct(frame, Settings.preset(preset, stages=stages, **settings)).image
     return image
 
 
@@ -128,6 +128,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--denoisers", nargs="*", default=DENOISERS)
     parser.add_argument("--stages", nargs="*", default=["deep-combiner"])
     parser.add_argument("--spp", type=int, nargs="*", default=FRAME_SPP)
+    parser.add_argument("--preset", default=Settings.default(), help="of the core; a table is of one")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args(arguments)
     if options.verb == "measure" and not (options.frames and options.weights):
