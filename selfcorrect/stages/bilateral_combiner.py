@@ -18,8 +18,8 @@ from selfcorrect.image.windows import reflected
 from selfcorrect.kernel.convolution import convolutions
 from selfcorrect.kernel.cross_bilateral import Window, cross_bilateral
 from selfcorrect.kernel.guides import Guides
+from selfcorrect.stages.combiner import Combiner
 from selfcorrect.stages.layers import convolution, start_flat
-from selfcorrect.stages.weights import TrainedNetwork
 
 __all__ = ["BilateralCombiner", "evidence"]
 
@@ -33,7 +33,7 @@ _FIRST_BETA_Z, _FIRST_TAU = 0.95, 0.05
 _LEAST_SHARE = 0.1  # of g: a share of 0 has no gradient, and where the first steps did harm it stayed there
 
 
-class BilateralCombiner(TrainedNetwork):
+class BilateralCombiner(Combiner):
     """Convolutions 3×3 with ReLU between them and zero padding, Eqs. 10 and 11, and the share of what they give.
 
     Args:
@@ -41,11 +41,6 @@ class BilateralCombiner(TrainedNetwork):
         window: side of the cross-bilateral window, odd.
         layers: convolutions.
         seed: of the first weights.
-
-    Attributes:
-        pairs: of a noisy and a denoised image: one.
-        window: as given.
-        reach: pixels that an output sees on each side.
     """
 
     kind = "bilateral-combiner"
@@ -60,8 +55,9 @@ class BilateralCombiner(TrainedNetwork):
         gammas = [math.log(math.expm1(term.first_bandwidth)) for term in _TERMS]
         first = [*(beta for beta in betas for _ in range(3)), *gammas, math.log(math.expm1(_FIRST_TAU)), 0.0]
         widths = [_INPUTS, *[width] * (layers - 1), len(first)]
-        self.convolutions = nn.ModuleList(convolution(i, o, 3, generator) for i, o in pairwise(widths))
-        start_flat(self.convolutions[-1], torch.tensor(first))
+        made = [convolution(i, o, 3, generator) for i, o in pairwise(widths)]
+        self.convolutions = nn.ModuleList(made)
+        start_flat(made[-1], torch.tensor(first))
 
     def forward(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
         """The combined radiance (N, 3, H, W) of what :meth:`weights` takes."""
@@ -69,29 +65,15 @@ class BilateralCombiner(TrainedNetwork):
         return self.combined(self.weights(*images), *(reflected(planes, self.window // 2) for planes in images))
 
     def weights(self, noisy: Tensor, denoised: Tensor, features: Tensor, precision: str = "fp32") -> Tensor:
-        """What the weights are made of, before its activations: β, γ, τ, α, (N, 15, H, W).
-
-        Args:
-            noisy: y, linear radiance of a mean near 1, (N, 1, 3, H, W).
-            denoised: z, the same shape.
-            features: normal, albedo, depth in 0 … 1, (N, 7, H, W); zeros where a frame has none.
-            precision: of the convolutions, "fp32" or "bf16".
-        """
+        """What the weights are made of, before its activations: β, γ, τ, α, (N, 15, H, W)."""
         y, z = noisy[:, 0], denoised[:, 0]
         shown = torch.cat([y.clamp(min=0), features, evidence(y, z), z.clamp(min=0)], 1)
-        parameters = [parameter for layer in self.convolutions for parameter in (layer.weight, layer.bias)]
+        parameters = list(self.convolutions.parameters())
         threads = torch.get_num_threads()
         return convolutions(list(shown), parameters, log_radiance=True, precision=precision, threads=threads)
 
     def combined(self, weights: Tensor, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
-        """Eqs. 10 and 11 and the share of their result, (N, 3, H, W).
-
-        Args:
-            weights: of :meth:`weights`.
-            noisy: y with ``window // 2`` pixels around.
-            denoised: z, the same.
-            features: the same.
-        """
+        """Eqs. 10 and 11 and the share of their result; see :class:`Combiner`."""
         margin = self.window // 2
         y, z = noisy[:, 0], denoised[:, 0]
         planes = torch.cat([y, features[:, 3:6], features[:, :3], z], 1)

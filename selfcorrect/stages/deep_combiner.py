@@ -18,12 +18,13 @@ from selfcorrect.image.tiles import Region, tiles
 from selfcorrect.image.windows import reflected
 from selfcorrect.settings import Settings
 from selfcorrect.stages.bilateral_combiner import BilateralCombiner
+from selfcorrect.stages.combiner import Combiner
 from selfcorrect.stages.images import StageImages
 from selfcorrect.stages.layers import convolution, start_flat, tau
 from selfcorrect.stages.stage import Outcome, Stage, Work
 from selfcorrect.stages.taps import windowed_sum
 from selfcorrect.stages.tiled import SIDE, around, autocast, cut, slices
-from selfcorrect.stages.weights import TrainedNetwork, of_stage
+from selfcorrect.stages.weights import of_stage
 
 __all__ = [
     "Combiner",
@@ -42,7 +43,7 @@ _LEAST_SUM = 1e-10  # as published
 _BEYOND = 1e9  # depth from here on is a renderer's word for nothing hit (Blender's is 1e10)
 
 
-class DeepCombiner(TrainedNetwork):
+class DeepCombiner(Combiner):
     """Six convolutions 5×5 of 100 filters and kernels of 15×15, ReLU after every layer including the last.
 
     It has one output for each pixel of the window and buffer, the centre among them, as the public code does: 1,595,725
@@ -159,10 +160,6 @@ def combined(weights: Tensor, residual: Tensor, denoised: Tensor, window: int) -
         moved = moved + taken + weight * (denoised[:, b] - base)
         total = total + weight
     return base + moved / total.clamp(min=_LEAST_SUM)
-
-
-Combiner = DeepCombiner | BilateralCombiner
-"""Either network, told apart by the file of its weights."""
 
 
 def feature_planes(
