@@ -31,6 +31,9 @@ __all__ = [
 _FLAGS = {"layers": "--network-layers"}
 """Of settings whose own name means another thing on the command line: --layers are those of the files."""
 
+_AFTER_WEAK = "deep-combiner,core"
+"""Stages for images of the denoisers in :data:`denoisers.WEAK`."""
+
 
 def add_aovs(parser: argparse.ArgumentParser) -> None:
     """The AOVs to correct."""
@@ -152,9 +155,6 @@ def check(options: argparse.Namespace) -> None:
         denoisers.check_threads(options.threads, "--threads")
     mapping(options)
     extra_files(options, settings)
-
-
-_AFTER_WEAK = "deep-combiner,core"
 
 
 def settings_of(options: argparse.Namespace) -> Settings:

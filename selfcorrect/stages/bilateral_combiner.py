@@ -1,7 +1,7 @@
 """The deep combiner that ships: weights of a closed form, of bandwidths that a network trained in advance predicts.
 
 Back et al. 2020 predict every weight of the window, with 1.6 M parameters. Here, as in the core, a small network gives
-each pixel the scales β, the bandwidths γ and the centre weight τ of Eqs. 10 and 11 of Back et al. 2022, and the share
+each pixel the scales β, the bandwidths γ and the center weight τ of Eqs. 10 and 11 of Back et al. 2022, and the share
 α that their g has of the result, ``z_c + α (g_c − z_c)``. The core learns on the frame itself, by its halves; this one
 has learned on other frames, by their references, and takes no training.
 """
