@@ -18,6 +18,7 @@ from selfcorrect.errors import DenoiserError, MissingPackageError, SettingsError
 
 __all__ = [
     "PACKAGED",
+    "WEAK",
     "Denoise",
     "DualPlugin",
     "Plugin",
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
 
 PACKAGED = Path(__file__).resolve().parent / "weights" / "denoiser.onnx"
 """The project's own model: ``onnx`` without a path."""
+
+WEAK = ("joint-bilateral",)
+"""Those whose images the deep combiner makes a better start for the core: `scripts/train/held_out.py` measures it."""
 
 _MOST_THREADS = 1024
 

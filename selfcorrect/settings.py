@@ -134,7 +134,7 @@ class Settings:
         "", "trained weights of the stage deep-combiner; by default the package's", _TRAINED, unit="file"
     )
     combiner_4_weights: str = _setting(
-        "", "trained weights of the stage deep-combiner-4; by default the package's", _TRAINED, unit="file"
+        "", "trained weights of the stage deep-combiner-4; the package has none", _TRAINED, unit="file"
     )
     combination: str = _setting(
         "eq10", "what the window's pixels are combined to", f"{_PAPER}, Table 1", choices=("eq10", "eq3")

@@ -2,7 +2,7 @@
 
     .venv/bin/python scripts/train/evaluate.py quality --data DATASET [--frames ../shared/frames] --out TABLE.csv
     .venv/bin/python scripts/train/evaluate.py table --out TABLE.csv
-    .venv/bin/python scripts/train/evaluate.py speed [--size 1024] [--threads 2]
+    .venv/bin/python scripts/train/evaluate.py speed [--size 1024] [--threads 2] [--methods oidn …]
 
 quality: one row a frame and method, written at once; rows that the file has are not measured again. relMSE is that of
 ``selfcorrect.metrics`` with two references and the smooth one. Denoisers are run on the mean of both halves; all else
@@ -16,7 +16,7 @@ import csv
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     torch.set_num_threads(options.threads)
     if options.verb == "speed":
-        speed(options.size, options.threads)
+        speed(options.size, options.threads, options.methods)
         return
     if options.verb == "quality":
         methods = [method for method in options.methods if available(method)]
@@ -201,7 +201,7 @@ def geometric(values: list[float]) -> float:
     return math.exp(sum(map(math.log, values)) / len(values))
 
 
-def speed(size: int, threads: int) -> None:
+def speed(size: int, threads: int, methods: Sequence[str]) -> None:
     """Seconds at size × size pixels of random numbers, and megabytes of the weights."""
     generator = torch.Generator().manual_seed(0)
 
@@ -212,7 +212,7 @@ def speed(size: int, threads: int) -> None:
     frame = Frame(color=pair(), denoised=pair(), albedo=pair(), normal=pair(), depth=pair(1))
     print(f"| {size}×{size}, {threads} thread(s) | s |\n|---|---|")
     for spec in ("onnx", "oidn"):
-        if available(spec):
+        if spec in methods and available(spec):
             denoise = denoisers.create(spec, threads=threads)
             arguments = [pairs[0] for pairs in (frame.color, frame.albedo, frame.normal) if pairs is not None]
             denoise(arguments[0], albedo=arguments[1], normal=arguments[2])  # the first call is slower
@@ -220,7 +220,7 @@ def speed(size: int, threads: int) -> None:
             denoise(arguments[0], albedo=arguments[1], normal=arguments[2])
             print(f"| {spec} | {time.perf_counter() - begun:.2f} |", flush=True)
     for stage in ("james-stein", "neural-james-stein", "deep-combiner"):
-        if available(stage):
+        if stage in methods and available(stage):
             begun = time.perf_counter()
             correct(frame, Settings.preset("balanced", stages=stage, guard=False))
             print(f"| {stage}, both halves and the full image | {time.perf_counter() - begun:.2f} |", flush=True)

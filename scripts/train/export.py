@@ -27,10 +27,11 @@ from selfcorrect.stages import weights
 
 PACKAGES = Path(__file__).resolve().parent.parent.parent
 ATTRIBUTION = (
-    "Trained on renders of procedural rooms and, with changed cameras, materials and lights, of the Mitsuba versions "
+    "Trained on renders, as they are or with changed cameras, materials and lights, of the Mitsuba versions "
     "(Benedikt Bitterli, https://benedikt-bitterli.me/resources/) of 'Contemporary Bathroom' by Mareck (CC0), "
     "'Japanese Classroom' by NovaZeeke (CC-BY 3.0), 'The Breakfast Room' by Wig42 (CC-BY 3.0), "
-    "'The White Room' by Jay-Artist (CC-BY 3.0) and 'The Wooden Staircase' by Wig42 (CC-BY 3.0)"
+    "'The White Room' by Jay-Artist (CC-BY 3.0) and 'The Wooden Staircase' by Wig42 (CC-BY 3.0), "
+    "and of scenes of this project"
 )
 OPSET = 18
 LARGEST = 256  # halvings: what export has to be told about sizes, times MULTIPLE
@@ -63,7 +64,8 @@ def default_path(network: str) -> Path:
     """Where a network's weights are in the package."""
     if network == "denoiser":
         return PACKAGES / "denoisers" / "weights" / "denoiser.onnx"
-    return PACKAGES / "selfcorrect" / "weights" / f"{network}.safetensors"
+    stage = "deep-combiner" if network == "bilateral-combiner" else network
+    return PACKAGES / "selfcorrect" / "weights" / f"{stage}.safetensors"
 
 
 def write_onnx(network: Denoiser, path: Path, facts: dict[str, Any]) -> None:

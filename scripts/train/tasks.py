@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from selfcorrect.frame import Half
+from selfcorrect.stages.bilateral_combiner import BilateralCombiner
 from selfcorrect.stages.deep_combiner import DeepCombiner
 from selfcorrect.stages.james_stein import james_stein, relative_weight, variance_of_mean
-from selfcorrect.stages.layers import tau
 from selfcorrect.stages.neural_james_stein import VarianceNetwork, neural_blend, tau_loss
 from selfcorrect.stages.regression import cross_buffer_regression
 
@@ -66,11 +66,6 @@ def relative_squared(result: Tensor, target: Tensor, level: Tensor) -> Tensor:
     return (((result.float() - target) ** 2).mean(1) / (level.mean(1) ** 2 + 0.01)).mean((1, 2))
 
 
-def tone_mapped(result: Tensor, target: Tensor, level: Tensor) -> Tensor:
-    """The same of τ(radiance), which bounds what bright pixels count for; for targets of little noise only."""
-    return relative_squared(tau(result.float()), tau(target), tau(level))
-
-
 class DenoiserTask:
     """Sub-images, halves and frames in turn; relative L2 to what OIDN makes of the frame, so mostly of more samples.
 
@@ -110,7 +105,7 @@ class DenoiserTask:
 
 
 class CombinerTask:
-    """Noisy and denoised images of all of a view's denoisers; tone-mapped relative L2 over the better input's.
+    """Noisy and denoised images of all of a view's denoisers; relative L2 over the better input's.
 
     Over the better input's, since the errors of views differ by factors of a thousand: so each view counts for the
     share of its error that could be gained, and 1 minus the loss is that gain.
@@ -136,8 +131,8 @@ class CombinerTask:
         """See :class:`Task`."""
         result = network(batch.noisy, batch.denoised, batch.features)
         inputs = (batch.denoised.mean(1), batch.noisy.mean(1))
-        start = torch.stack([tone_mapped(image, batch.target, batch.level) for image in inputs]).amin(0)
-        return tone_mapped(result, batch.target, batch.level) / (start + _LEAST_ERROR)
+        start = torch.stack([relative_squared(image, batch.target, batch.level) for image in inputs]).amin(0)
+        return relative_squared(result, batch.target, batch.level) / (start + _LEAST_ERROR)
 
     def judge(self, network: nn.Module, view: View) -> list[Judged]:
         """See :class:`Task`; one result for each denoiser."""
@@ -152,6 +147,14 @@ class CombinerTask:
             result = network(noisy, images[list(keys)].movedim(-1, 1)[None] * scale, features) / scale
             found.append(Judged(_image(result), images[WHOLE], view.color[:4].mean(0)))
         return found
+
+
+class BilateralCombinerTask(CombinerTask):
+    """The same for the combiner with bilateral weights."""
+
+    def build(self) -> nn.Module:
+        """See :class:`Task`."""
+        return BilateralCombiner(**self.architecture, seed=self.seed)
 
 
 class JamesSteinTask:
@@ -290,6 +293,7 @@ def _image(planes: Tensor) -> Tensor:
 TASKS: dict[str, tuple[Callable[[dict[str, Any], int, int], Task], dict[str, Any]]] = {
     "denoiser": (DenoiserTask, {}),
     "james-stein": (JamesSteinTask, {}),
+    "bilateral-combiner": (BilateralCombinerTask, {}),
     "deep-combiner": (CombinerTask, {"buffers": 1}),
     "deep-combiner-4": (CombinerTask, {"buffers": 4}),
 }

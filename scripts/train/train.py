@@ -3,14 +3,14 @@
     .venv/bin/python scripts/train/train.py denoiser --data DATASET --out RUN --minutes 45 [--batch 8] [--threads 1]
     .venv/bin/python scripts/train/train.py deep-combiner --width 32 --kernel 3 --data DATASET --out RUN --steps 5000
 
-Networks: denoiser, james-stein, deep-combiner, deep-combiner-4; what each is shown and its loss: ``tasks.py``. AdamW, a
-short warm-up, then a cosine to 0 over the steps or minutes given; bf16 autocast where the processor has it; an
-exponential mean of the weights is what is validated and exported. Targets are noisy, and their fireflies are not
-clamped: where the gradient's norm is over twice its running geometric mean, it is scaled down to that. That bounds what
-one firefly does, and darkens a little: the column radiance of the validation says how much.
+Networks: denoiser, james-stein, bilateral-combiner, deep-combiner, deep-combiner-4; what each is shown and its loss:
+``tasks.py``. AdamW, a short warm-up, then a cosine to 0 over the steps or minutes given; bf16 autocast where the
+processor has it; an exponential mean of the weights is what is validated and exported. Targets are noisy, and their
+fireflies are not clamped: where the gradient's norm is over twice its running geometric mean, it is scaled down to
+that. That bounds what one firefly does, and darkens a little: the column radiance of the validation says how much.
 
-``--hold-out NAME`` trains on no view of that scene and validates on those alone; ``--at-most N`` trains on the first N
-views: several runs are a learning curve.
+``--hold-out NAME`` trains on no view of that scene and validates on those alone; ``--at-most N`` trains on N views,
+evenly out of all: several runs are a learning curve.
 
 RUN gets ``checkpoint.pt`` (every minute, under a temporary name first), ``losses.csv`` (each step), ``validation.csv``
 (every five minutes, with clean references) and ``curves.png``. The same command goes on where a killed one was; with
@@ -117,7 +117,8 @@ def files_of(options: argparse.Namespace) -> dict[str, list[Path]]:
         scenes = {path: dataset.metadata_of(path)["scene"] for paths in files.values() for path in paths}
         files["train"] = [path for path in files["train"] if scenes[path] != options.hold_out]
         files["validation"] = [path for path in files["validation"] if scenes[path] == options.hold_out]
-    files["train"] = files["train"][: options.at_most]
+    count = min(options.at_most or len(files["train"]), len(files["train"]))
+    files["train"] = [files["train"][i * len(files["train"]) // count] for i in range(count)]
     if not files["train"]:
         raise SystemExit(f"{options.data / 'train'}: expected views (*.safetensors), but found none")
     return files

@@ -33,6 +33,9 @@ __all__ = [
 _FLAGS = {"layers": "--network-layers"}
 """Of settings whose own name means another thing on the command line: --layers are those of the files."""
 
+_AFTER_WEAK = "deep-combiner,core"
+"""Stages for images of the denoisers in :data:`denoisers.WEAK`."""
+
 
 def add_aovs(parser: argparse.ArgumentParser) -> None:
     """The AOVs to correct."""
@@ -166,6 +169,8 @@ def check(options: argparse.Namespace) -> None:
 def settings_of(options: argparse.Namespace) -> Settings:
     """The preset, with what --settings, --set and single flags change.
 
+    A weak denoiser's images go through the deep combiner first, unless stages are named or the preset is ``paper``.
+
     Raises:
         SettingsError: a setting is unknown, out of its range, or given by --set and by a flag.
     """
@@ -180,7 +185,11 @@ def settings_of(options: argparse.Namespace) -> Settings:
         named[name] = Settings.parsed(name, text.strip())
     if twice := sorted(given.keys() & named.keys()):
         raise SettingsError(f"expected {twice[0]} once, but got --set {twice[0]} and {_flag(twice[0])}")
-    return Settings.preset(options.preset, **(_from_file(options.settings_file) | given | named))
+    changes = _from_file(options.settings_file) | given | named
+    denoiser = getattr(options, "denoiser", None) or denoisers.default()
+    if options.preset != "paper" and denoiser in denoisers.WEAK:
+        changes = {"stages": _AFTER_WEAK} | changes
+    return Settings.preset(options.preset, **changes)
 
 
 def _from_file(path: str | None) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from functools import reduce
 from itertools import chain
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from selfcorrect.buffers import COLOR, DENOISED, INPUTS, TERMS, Buffer
@@ -104,6 +105,12 @@ class Guides:
         planes.clamp_(-LARGEST, LARGEST)
         terms = tuple(term for term in TERMS if term.name in there)
         return cls(planes, bottom - top, right - left, margin, terms)
+
+    @classmethod
+    def of_planes(cls, planes: Tensor, margin: int, terms: tuple[Buffer, ...]) -> "Guides":
+        """Guides of planes (C, H + 2·margin, W + 2·margin) that have their margin, in the order of ``planes``."""
+        height, width = (side - 2 * margin for side in planes.shape[1:])
+        return cls(F.pad(planes, (0, _LANES)), height, width, margin, terms)
 
     @classmethod
     def stack(cls, crops: Iterable["Guides"], count: int) -> "Guides":

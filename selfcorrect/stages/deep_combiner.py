@@ -17,14 +17,24 @@ from selfcorrect.image.exposure import LARGEST, scale_
 from selfcorrect.image.tiles import Region, tiles
 from selfcorrect.image.windows import reflected
 from selfcorrect.settings import Settings
+from selfcorrect.stages.bilateral_combiner import BilateralCombiner
+from selfcorrect.stages.combiner import Combiner
 from selfcorrect.stages.images import StageImages
 from selfcorrect.stages.layers import convolution, start_flat, tau
 from selfcorrect.stages.stage import Outcome, Stage, Work
 from selfcorrect.stages.taps import windowed_sum
 from selfcorrect.stages.tiled import SIDE, around, autocast, cut, slices
-from selfcorrect.stages.weights import TrainedNetwork, of_stage
+from selfcorrect.stages.weights import of_stage
 
-__all__ = ["DeepCombiner", "DeepCombinerStage", "combine_whole", "combined", "feature_planes", "opened_network"]
+__all__ = [
+    "Combiner",
+    "DeepCombiner",
+    "DeepCombinerStage",
+    "combine_whole",
+    "combined",
+    "feature_planes",
+    "opened_network",
+]
 
 _FEATURES = 7  # normal, albedo, depth
 _FIRST_ANCHOR = 4  # of the window's weights together: training starts near the denoised image
@@ -33,7 +43,7 @@ _LEAST_SUM = 1e-10  # as published
 _BEYOND = 1e9  # depth from here on is a renderer's word for nothing hit (Blender's is 1e10)
 
 
-class DeepCombiner(TrainedNetwork):
+class DeepCombiner(Combiner):
     """Six convolutions 5×5 of 100 filters and kernels of 15×15, ReLU after every layer including the last.
 
     It has one output for each pixel of the window and buffer, the centre among them, as the public code does: 1,595,725
@@ -104,16 +114,19 @@ class DeepCombiner(TrainedNetwork):
             denoised: z, the same shape.
             features: normal, albedo, depth in 0 … 1, (N, 7, H, W); zeros where a frame has none.
         """
-        weights = self.weights(noisy, denoised, features)
-        residual = reflected(noisy - denoised, self.window // 2)
-        return combined(weights, residual, denoised, self.window)
+        images = (noisy, denoised, features)
+        return self.combined(self.weights(*images), *(reflected(planes, self.window // 2) for planes in images))
 
-    def weights(self, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
-        """Weights (N, B, window², H, W) ≥ 0, by rows of the window, and the anchor; bfloat16 where autocast says so."""
+    def weights(self, noisy: Tensor, denoised: Tensor, features: Tensor, precision: str = "fp32") -> Tensor:
+        """Weights (N, B, window², H, W) ≥ 0, by rows of the window, and the anchor.
+
+        They are bfloat16 where autocast or the precision says so.
+        """
         shown = [tau(denoised).flatten(1, 2), tau(noisy).flatten(1, 2), features]
         planes = torch.cat(shown, 1).contiguous(memory_format=torch.channels_last)
-        for layer in self.convolutions:
-            planes = layer(planes).relu()
+        with autocast(planes, precision):
+            for layer in self.convolutions:
+                planes = layer(planes).relu()
         weights: Tensor = planes.unflatten(1, (self.pairs, -1))
         if self.scaled:
             scale = weights.new_ones(weights.shape[2], 1, 1)
@@ -121,6 +134,13 @@ class DeepCombiner(TrainedNetwork):
                 scale[tap] = factor
             weights = weights * scale
         return weights
+
+    def combined(self, weights: Tensor, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
+        """The combined radiance (N, 3, H, W) by given weights; the images have ``window // 2`` pixels around them."""
+        del features  # the weights know them
+        pad = self.window // 2
+        inner = (..., slice(pad, denoised.shape[-2] - pad), slice(pad, denoised.shape[-1] - pad))
+        return combined(weights, noisy - denoised, denoised[inner], self.window)
 
 
 def combined(weights: Tensor, residual: Tensor, denoised: Tensor, window: int) -> Tensor:
@@ -167,7 +187,7 @@ def feature_planes(
 
 @torch.no_grad()
 def combine_whole(
-    network: DeepCombiner,
+    network: Combiner,
     noisy: Sequence[Tensor],
     denoised: Sequence[Tensor],
     features: Tensor,
@@ -188,30 +208,30 @@ def combine_whole(
         side: of the tiles, pixels.
     """
 
-    def radiance(images: Sequence[Tensor], region: Region, reach: int = 0) -> Tensor:
-        parts = [cut(image.permute(2, 0, 1), region, reach).double() * scale for image in images]
-        return torch.stack(parts).clamp_(-LARGEST, LARGEST).float()
+    def shown(region: Region, reach: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+        return radiance(noisy, region, reach), radiance(denoised, region, reach), cut(features, region, reach)[None]
 
-    size, pad = (features.shape[1], features.shape[2]), network.window // 2
+    def radiance(images: Sequence[Tensor], region: Region, reach: int) -> Tensor:
+        parts = [cut(image.permute(2, 0, 1), region, reach).double() * scale for image in images]
+        return torch.stack(parts).clamp_(-LARGEST, LARGEST).float()[None]
+
+    size = (features.shape[1], features.shape[2])
     result = torch.empty_like(noisy[0])
     for region in tiles(size, side):
         wide, inside = around(region, network.reach, size)
-        shown = radiance(noisy, wide), radiance(denoised, wide), cut(features, wide)
-        with autocast(features, precision):
-            weights = network.weights(*(planes[None] for planes in shown))[(..., *inside)]
-        residual = radiance(noisy, region, pad) - radiance(denoised, region, pad)
-        tile = combined(weights, residual[None], radiance(denoised, region)[None], network.window)
+        weights = network.weights(*shown(wide), precision)[(..., *inside)]
+        tile = network.combined(weights, *shown(region, network.window // 2))
         result[slices(region)] = tile[0].permute(1, 2, 0)
     return scale_(result, 1 / scale)
 
 
-def opened_network(stage: str, settings: Settings, setting: str, packaged: str, *, pairs: int) -> DeepCombiner:
+def opened_network(stage: str, settings: Settings, setting: str, packaged: str, *, pairs: int) -> Combiner:
     """The network of a stage, of so many pairs of a noisy and a denoised image.
 
     Raises:
         FileError: weights are missing, do not fit, or are for another number of pairs.
     """
-    network, path = of_stage(stage, settings, setting, packaged, DeepCombiner)
+    network, path = of_stage(stage, settings, setting, packaged, DeepCombiner, BilateralCombiner)
     if network.pairs != pairs:
         raise FileError(f"{path}: expected weights of {stage}, but got those for {network.pairs} denoised images")
     return network
@@ -240,7 +260,7 @@ class DeepCombinerStage(Stage):
 
     def combined(
         self,
-        network: DeepCombiner,
+        network: Combiner,
         noisy: Sequence[Tensor],
         denoised: Sequence[Tensor],
         halves: Sequence[Half],

@@ -74,8 +74,8 @@ def save(
     publish(Path(path), safetensors.torch.save(tensors, metadata))
 
 
-def load(path: str | Path, kind: type[Kind]) -> Kind:
-    """Read a network of a kind, in float32, for evaluation.
+def load(path: str | Path, *kinds: type[Kind]) -> Kind:
+    """Read a network of one of these kinds, in float32, for evaluation.
 
     Raises:
         FileError: the file is missing, holds no weights of selfcorrect or those of another network, or they do not fit
@@ -93,15 +93,18 @@ def load(path: str | Path, kind: type[Kind]) -> Kind:
     if metadata.get("format") != _FORMAT:
         got = metadata.get("format", "another safetensors file")
         raise FileError(f"{path}: expected '{_FORMAT}', but got {got!r}; export the weights again")
-    return _built(path, kind, metadata, tensors)
+    return _built(path, kinds, metadata, tensors)
 
 
-def _built(path: str | Path, kind: type[Kind], metadata: Mapping[str, str], tensors: dict[str, Tensor]) -> Kind:
+def _built(
+    path: str | Path, kinds: tuple[type[Kind], ...], metadata: Mapping[str, str], tensors: dict[str, Tensor]
+) -> Kind:
     name, architecture = metadata.get("network", ""), metadata.get("architecture", "")
-    if name != kind.kind:
-        raise FileError(f"{path}: expected weights of {kind.kind}, but got those of {name or 'no network'}")
+    known = {kind.kind: kind for kind in kinds}
+    if name not in known:
+        raise FileError(f"{path}: expected weights of {' or '.join(known)}, but got those of {name or 'no network'}")
     try:
-        network = kind(**json.loads(architecture))
+        network = known[name](**json.loads(architecture))
         network.load_state_dict(tensors)
     except (TypeError, ValueError, RuntimeError, LookupError, RecursionError) as error:
         reason = " ".join(str(error).split())
@@ -111,7 +114,7 @@ def _built(path: str | Path, kind: type[Kind], metadata: Mapping[str, str], tens
     return network.eval().requires_grad_(requires_grad=False)
 
 
-def of_stage(stage: str, settings: Settings, setting: str, packaged: str, kind: type[Kind]) -> tuple[Kind, Path]:
+def of_stage(stage: str, settings: Settings, setting: str, packaged: str, *kinds: type[Kind]) -> tuple[Kind, Path]:
     """The user's own weights of a stage, else the package's; and their file.
 
     Args:
@@ -119,7 +122,7 @@ def of_stage(stage: str, settings: Settings, setting: str, packaged: str, kind: 
         settings: of the frame.
         setting: the one that names the user's file.
         packaged: name of the package's file, without ending.
-        kind: of the network.
+        kinds: that the network may be of.
 
     Raises:
         FileError: see :func:`load`.
@@ -128,4 +131,4 @@ def of_stage(stage: str, settings: Settings, setting: str, packaged: str, kind: 
     if not path.is_file():
         flag = setting.replace("_", "-")
         raise FileError(f"{path}: expected the weights of the stage {stage}, but got no file; name one with --{flag}")
-    return load(path, kind), path
+    return load(path, *kinds), path

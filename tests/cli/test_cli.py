@@ -73,6 +73,27 @@ def test_a_default_without_oidn_is_told_of(
     assert named or told[0].endswith("run: pip install 'selfcorrect[oidn]'")
 
 
+@pytest.mark.parametrize(
+    ("flags", "stages"),
+    [
+        ([], "deep-combiner,core"),
+        (["--stages", "core"], "core"),
+        (["--set", "stages=core"], "core"),
+        (PAPER, "core"),
+        (["--denoiser", "nlm"], "core"),
+    ],
+)
+def test_a_weak_denoisers_images_are_combined_first(
+    flags: list[str], stages: str, halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    given = [*BALANCED, "--epochs", "1", "--denoiser", "joint-bilateral", *flags]
+    result = call("frame", *halves, "-o", tmp_path / "out.exr", "--json", *given)
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["settings"]["stages"] == stages
+    assert ("deep-combiner" in report["seconds"]) == ("combiner" in stages)
+
+
 def test_same_seed_writes_the_same_pixels(halves: tuple[Path, Path], tmp_path: Path) -> None:
     for name in ("one", "two"):
         assert call("frame", *halves, "-o", tmp_path / f"{name}.exr", *FAST).returncode == 0

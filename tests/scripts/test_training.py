@@ -15,6 +15,7 @@ import cut_frames
 import dataset
 import evaluate
 import export
+import held_out
 import onnx
 import pytest
 import torch
@@ -30,13 +31,21 @@ import denoisers
 from selfcorrect import Frame
 from selfcorrect.errors import DenoiserError
 from selfcorrect.stages import weights
+from selfcorrect.stages.bilateral_combiner import BilateralCombiner
 from selfcorrect.stages.deep_combiner import DeepCombiner
 from selfcorrect.stages.neural_james_stein import VarianceNetwork
 
 SCRIPTS = CHECKOUT / "scripts" / "train"
-MAINS = {"train": train.main, "export": export.main, "evaluate": evaluate.main}
+MAINS = {"train": train.main, "export": export.main, "evaluate": evaluate.main, "held_out": held_out.main}
 NARROW = ("--width", 8, "--window", 5, "--layers", 3, "--kernel", 3)
-NETWORKS = {"denoiser": (), "james-stein": (), "deep-combiner": NARROW, "deep-combiner-4": NARROW}
+BILATERAL = ("--width", 8, "--window", 5, "--layers", 3)
+NETWORKS = {
+    "denoiser": (),
+    "james-stein": (),
+    "bilateral-combiner": BILATERAL,
+    "deep-combiner": NARROW,
+    "deep-combiner-4": NARROW,
+}
 
 
 def command(script: str, *arguments: object) -> list[str]:
@@ -215,6 +224,15 @@ class TestTraining:
         assert [path.stem for path in found["train"]] == ["one"]
         assert [path.stem for path in found["validation"]] == ["two"]
 
+    def test_fewer_views_are_taken_evenly(self, tmp_path: Path) -> None:
+        for part, i in itertools.product(("train", "validation"), range(6)):
+            (tmp_path / part).mkdir(exist_ok=True)
+            dataset.save(tmp_path / part / f"{i}.safetensors", make_view(0, 16, clean=False), {})
+        for count, expected in ((2, "03"), (4, "0134"), (6, "012345"), (9, "012345")):
+            shared = ["denoiser", "--steps", "1", "--out", "x", "--data", str(tmp_path)]
+            found = train.files_of(train.parse([*shared, "--at-most", str(count)]))
+            assert "".join(path.stem for path in found["train"]) == expected
+
     def test_another_run_is_not_continued(self, data: Path, runs: Path) -> None:
         with pytest.raises(SystemExit, match="use another --out"):
             ran(*training("denoiser", data, runs / "denoiser", "--steps", 5))
@@ -269,11 +287,11 @@ class TestExport:
         with pytest.raises(DenoiserError, match="expected a frame with albedo, but got one without"):
             denoisers.create(f"onnx:{tmp_path / 'strict.onnx'}")(torch.rand(16, 16, 3))
 
-    @pytest.mark.parametrize("network", ["james-stein", "deep-combiner", "deep-combiner-4"])
+    @pytest.mark.parametrize("network", [network for network in NETWORKS if network != "denoiser"])
     def test_weights_are_what_the_stages_load(self, runs: Path, tmp_path: Path, network: str) -> None:
         path = tmp_path / f"{network}.safetensors"
         ran("export", runs / network, "--out", path)
-        found = weights.load(path, VarianceNetwork if network == "james-stein" else DeepCombiner).state_dict()
+        found = weights.load(path, VarianceNetwork, DeepCombiner, BilateralCombiner).state_dict()
         mean = torch.load(runs / network / "checkpoint.pt", weights_only=True)["run"]["mean"]
         assert all(torch.equal(found[name], value.half().float()) for name, value in mean.items())
 
@@ -299,6 +317,41 @@ class TestEvaluate:
         }
         assert means["noisy"][3] == means["oidn"][5] == "1"
         assert float(means["oidn"][3]) < 1
+
+
+class TestHeldOut:
+    def test_the_table_is_over_the_denoiser_of_each_frame(self) -> None:
+        rows = [
+            {"frame": name, "spp": "64", "denoiser": "oidn", "stages": stages, "relmse": error, "radiance": "0.99"}
+            for name, stages, error in (
+                ("a", "none", "0.1"),
+                ("a", "deep-combiner", "0.05"),
+                ("b", "none", "0.4"),
+                ("b", "deep-combiner", "0.8"),
+                ("b", "core", "0.2"),
+            )
+        ]
+        assert held_out.table(rows).splitlines()[2:] == [
+            "| oidn | core | 1 | 0.500 (0.50) | 0.9900 |",
+            "| oidn | deep-combiner | 2 | 1.000 (2.00) | 0.9900 |",
+        ]
+
+    @pytest.mark.shared
+    def test_rows_are_measured_once_with_the_scenes_own_weights(self, shared: Path, tmp_path: Path) -> None:
+        frames, out = tmp_path / "frames", tmp_path / "table.csv"
+        frames.mkdir()
+        for path in (shared / "frames").glob("staircase_*"):
+            if "ref" in path.name or "016" in path.name:
+                (frames / path.name).symlink_to(path)
+        network = BilateralCombiner(8, 5, 3)
+        weights.save(tmp_path / "staircase.safetensors", network, settings={}, data="", attribution="")
+        options = ("measure", frames, "--weights", tmp_path, "--out", out, "--spp", 16, "--denoisers", "box")
+        said = ran("held_out", *options)
+        assert "| box | deep-combiner | 1 |" in said
+        first = out.read_text()
+        assert len(first.splitlines()) == 3
+        ran("held_out", *options)
+        assert out.read_text() == first
 
 
 @pytest.mark.mitsuba

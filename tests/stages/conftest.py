@@ -9,17 +9,19 @@ from helpers.trained import SMALL, wild, write_render
 
 from selfcorrect import exr
 from selfcorrect.stages import weights
+from selfcorrect.stages.bilateral_combiner import BilateralCombiner
 from selfcorrect.stages.deep_combiner import DeepCombiner
 from selfcorrect.stages.neural_james_stein import VarianceNetwork
 
 
-@pytest.fixture(scope="module")
-def weight_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Untrained weights, on disk as float32; a setting for each."""
+@pytest.fixture(scope="module", params=["deep", "bilateral"])
+def weight_files(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Untrained weights, on disk as float32; a setting for each. The combiner of one pair is of either kind."""
+    one = DeepCombiner(**SMALL, seed=2) if request.param == "deep" else BilateralCombiner(8, 5, 3, seed=2)
     folder = tmp_path_factory.mktemp("weights")
     networks = {
         "james_stein_weights": wild(VarianceNetwork(1)),
-        "combiner_weights": wild(DeepCombiner(**SMALL, seed=2)),
+        "combiner_weights": wild(one),
         "combiner_4_weights": wild(DeepCombiner(4, **SMALL, seed=3)),
     }
     for name, network in networks.items():

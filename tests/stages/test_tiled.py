@@ -9,6 +9,7 @@ from helpers.trained import SIZE, SMALL, make_both, make_frame, planes, wild
 from torch import Tensor
 
 from selfcorrect.frame import mean
+from selfcorrect.stages.bilateral_combiner import BilateralCombiner
 from selfcorrect.stages.deep_combiner import DeepCombiner, combine_whole, feature_planes
 from selfcorrect.stages.james_stein import variance_of_mean
 from selfcorrect.stages.neural_james_stein import VarianceNetwork, blend_whole, neural_blend
@@ -23,15 +24,18 @@ def test_tiles_are_equal_to_the_whole(size: tuple[int, int], precision: str, tol
     a, b = frame.color
     normal, albedo = torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(1))
     features = feature_planes(size, normal=normal, albedo=albedo, depth=None)
-    combiner, variance_network = wild(DeepCombiner(**SMALL)), wild(VarianceNetwork())
+    combiners, variance_network = (
+        (wild(DeepCombiner(**SMALL)), wild(BilateralCombiner(8, 5, 3))),
+        wild(VarianceNetwork()),
+    )
 
-    def both(side: int) -> tuple[Tensor, Tensor]:
+    def each(side: int) -> list[Tensor]:
         options: dict[str, Any] = {"precision": precision, "side": side}
-        one = combine_whole(combiner, (a,), (frame.denoised[0],), features, **options)
         y = frame.denoised
-        return one, blend_whole(variance_network, mean((a, b)), ((a - b) / 2) ** 2, *y, **options)
+        found = [combine_whole(network, (a,), (y[0],), features, **options) for network in combiners]
+        return [*found, blend_whole(variance_network, mean((a, b)), ((a - b) / 2) ** 2, *y, **options)]
 
-    for whole, pieces, different in zip(both(4096), both(32), (a, mean((a, b))), strict=True):
+    for whole, pieces, different in zip(each(4096), each(32), (a, a, mean((a, b))), strict=True):
         found = (pieces - whole).abs()
         assert float(found.quantile(0.999)) <= tolerance
         assert float(found.max()) <= max(tolerance, _FLIP if precision == "bf16" else 0)
