@@ -32,7 +32,7 @@ import torch
 
 from selfcorrect.image.windows import box_mean
 from selfcorrect.settings import Settings
-from selfcorrect.stages.deep_combiner import DeepCombiner, combine_whole, feature_planes, opened_network
+from selfcorrect.stages.deep_combiner import Combiner, combine_whole, feature_planes, opened_network
 from selfcorrect.stages.uncorrelated import KERNELS, WINDOW, combine
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "render"))
@@ -98,7 +98,7 @@ def _features(scene: Any) -> Image:
 
 
 def round_of(
-    crn: Any, place: Place, number: int, network: DeepCombiner, options: argparse.Namespace
+    crn: Any, place: Place, number: int, network: Combiner, options: argparse.Namespace
 ) -> dict[str, Image]:
     """The images of a round by name; what its file lacks is made."""
     file = _file(place, number, options)
@@ -114,7 +114,7 @@ def round_of(
     return {name: image for name, image in found.items() if not name.startswith("renders")}
 
 
-def missing(found: dict[str, Image], features: Image, network: DeepCombiner, spp: int) -> Iterator[tuple[str, Image]]:
+def missing(found: dict[str, Image], features: Image, network: Combiner, spp: int) -> Iterator[tuple[str, Image]]:
     """What each method makes of four independent and four correlated renders, where it is not there yet."""
     y, z = found["renders y"], found["renders z"]
     if "y" not in found:
@@ -134,7 +134,7 @@ def missing(found: dict[str, Image], features: Image, network: DeepCombiner, spp
         yield "deep combiner, as shipped", deep_combined(network, y.mean(0), z.mean(0), features)
 
 
-def deep_combined(network: DeepCombiner, y: Image, z: Image, features: Image) -> Image:
+def deep_combined(network: Combiner, y: Image, z: Image, features: Image) -> Image:
     """The deep combiner's image of the pair, at the exposure that the tool would bring it to."""
     albedo, normal, depth = (torch.from_numpy(part) for part in np.split(features, [3, 6], -1))
     planes = feature_planes((y.shape[0], y.shape[1]), normal=normal, albedo=albedo, depth=depth)
