@@ -97,9 +97,7 @@ def _features(scene: Any) -> Image:
     return np.array(mi.render(scene, integrator=mi.load_dict(aovs), spp=_FEATURE_SPP, seed=0))[..., -7:]
 
 
-def round_of(
-    crn: Any, place: Place, number: int, network: Combiner, options: argparse.Namespace
-) -> dict[str, Image]:
+def round_of(crn: Any, place: Place, number: int, network: Combiner, options: argparse.Namespace) -> dict[str, Image]:
     """The images of a round by name; what its file lacks is made."""
     file = _file(place, number, options)
     found = dict(np.load(file)) if file.exists() else {}
