@@ -70,7 +70,8 @@ class BilateralCombiner(Combiner):
         shown = torch.cat([y.clamp(min=0), features, evidence(y, z), z.clamp(min=0)], 1)
         parameters = list(self.convolutions.parameters())
         threads = torch.get_num_threads()
-        return convolutions(list(shown), parameters, log_radiance=True, precision=precision, threads=threads)
+        heads = convolutions(list(shown), parameters, log_radiance=True, precision=precision, threads=threads)
+        return heads.to(noisy.dtype)  # where training casts by itself they are bfloat16
 
     def combined(self, weights: Tensor, noisy: Tensor, denoised: Tensor, features: Tensor) -> Tensor:
         """Eqs. 10 and 11 and the share of their result; see :class:`Combiner`."""
