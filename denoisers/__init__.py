@@ -106,7 +106,8 @@ def create(spec: str, *, threads: int | None = None, scratch: int | None = None)
         scratch: bytes that ``oidn`` may take beside its images; the others manage their own memory.
 
     Raises:
-        DenoiserError: the specification is unknown, or the model, the command or the class does not fit.
+        DenoiserError: the specification is unknown, the model, the command or the class does not fit, or OIDN does not
+            load.
         FileError: the model or the Python file is missing.
         MissingPackageError: the denoiser needs an optional package; the message says what to run.
         SettingsError: ``threads`` is out of range.

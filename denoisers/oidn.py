@@ -7,9 +7,13 @@ Linux on aarch64, and takes 179 MB on Linux, most of it libraries for GPUs that 
 """
 
 import torch
-from mitsuba_oidn import Device, DeviceType, Error
 
 from selfcorrect.errors import DenoiserError
+
+try:
+    from mitsuba_oidn import Device, DeviceType, Error
+except RuntimeError as error:  # of its thread pool, which needs a library that comes with compilers, not with Debian
+    raise DenoiserError(f"OIDN does not load; on Debian and Ubuntu it needs libatomic1: {error}") from error
 
 __all__ = ["MODES", "Oidn", "PrefilteringOidn", "oidn"]
 

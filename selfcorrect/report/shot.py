@@ -129,11 +129,11 @@ def _summary(frames: Sequence[ShotFrame]) -> str:
     if not any(change < 0 for change, _ in changes):
         return f"{words.KEPT}, in every frame"
     ratio = float(np.exp(np.mean([np.log(max(1 + change, 1e-6)) for change, _ in changes])))
-    best, worst = min(changes), max(changes)
-    return (
-        f"Error about {100 * (1 - ratio):.0f} % lower over the shot, from {words.percent(worst[0])} in frame "
-        f"{worst[1]} to {words.percent(best[0])} in frame {best[1]}"
-    )
+    lower = f"Error about {100 * (1 - ratio):.0f} % lower over the shot"
+    (best, at_best), (worst, at_worst) = min(changes), max(changes)
+    if words.percent(best) == words.percent(worst):
+        return lower
+    return f"{lower}, from {words.percent(worst)} in frame {at_worst} to {words.percent(best)} in frame {at_best}"
 
 
 def _table(frames: Sequence[ShotFrame]) -> str:

@@ -4,6 +4,7 @@ import os
 import shlex
 import subprocess
 import sys
+import types
 import weakref
 from pathlib import Path
 from typing import Any
@@ -306,6 +307,17 @@ class TestSpecifications:
             MissingPackageError, match=rf"{extra} needs .* pip install '{package.replace('_', '-')}>=[\d.]+'$"
         ):
             denoisers.create(spec)
+
+    def test_oidn_without_its_library_is_one_line(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refused(name: str) -> None:
+            raise RuntimeError(f"could not load the thread pool library for {name}")
+
+        package = types.ModuleType("mitsuba_oidn")
+        monkeypatch.setattr(package, "__getattr__", refused, raising=False)
+        monkeypatch.setitem(sys.modules, "mitsuba_oidn", package)
+        monkeypatch.delitem(sys.modules, "denoisers.oidn", raising=False)
+        with pytest.raises(DenoiserError, match=r"^OIDN does not load; .* needs libatomic1: could not load"):
+            denoisers.create("oidn")
 
     def test_importing_the_package_imports_no_denoiser(self) -> None:
         heavy = ("kornia", "mitsuba_oidn", "onnxruntime")

@@ -321,6 +321,12 @@ class TestWhereThingsStand:
             cell = self.box(driver, f".points tbody tr :nth-child({column})")
             assert cell["x"] + cell["width"] <= 400
 
+    def test_a_caption_is_read_without_scrolling(self, opened: Any) -> None:
+        driver = opened(bench_page(), 400)
+        caption = self.box(driver, ".points caption")
+        assert self.box(driver, ".points")["width"] > 400
+        assert caption["x"] + caption["width"] <= 400
+
 
 def test_the_frame_asked_for_last_is_shown(opened: Any) -> None:
     """Though another one, which had to be unpacked first, was asked for a moment before."""

@@ -166,7 +166,16 @@ class TestShotPage:
         data = data_of(page)
         assert len(data["frames"]) == 300
         assert sum(bool(frame["layers"]) for frame in data["frames"]) == 6
-        assert "Error about 31 % lower over the shot" in page
+        assert "Error about 31 % lower over the shot.<" in page
+
+    def test_the_least_and_the_most_gain_of_a_shot(self) -> None:
+        changes = (-0.31, -0.1, -0.5)
+        frames = [
+            report.ShotFrame(number, "written", {"estimate": ESTIMATE | {"change": change}})
+            for number, change in enumerate(changes, 1)
+        ]
+        page = report.shot_page(frames, {"title": "shot"})
+        assert "lower over the shot, from −10 % in frame 2 to −50 % in frame 3.<" in page
 
     def test_of_frames_that_failed_or_were_there(self) -> None:
         frames = [report.ShotFrame(1, "failed", {"reason": "no file"}), report.ShotFrame(2, "skipped", {})]
