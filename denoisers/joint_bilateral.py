@@ -7,8 +7,6 @@ On a scene with rare bright paths, filtering the logarithm of the colour guided 
 light, filtering radiance with the same guide 10 %, with this one 0.3 %.
 """
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from math import ceil
 
@@ -16,6 +14,7 @@ import torch
 from kornia.filters import joint_bilateral_blur, median_blur
 
 from denoisers.mirror import mirrored
+from selfcorrect.image.threads import in_threads
 
 __all__ = ["JointBilateral"]
 
@@ -67,24 +66,8 @@ class JointBilateral:
         height, width = color.shape[:2]
         rows, columns = (ceil(side / ceil(side / self.tile)) for side in (height, width))
         corners = product(range(0, height, rows), range(0, width, columns))
-        _in_threads(filter_tile, corners, self.threads or torch.get_num_threads())
+        in_threads(filter_tile, corners, self.threads)
         return output
-
-
-def _in_threads(function: Callable[[tuple[int, int]], None], items: Iterable[tuple[int, int]], threads: int) -> None:
-    """Call a function on every item in threads of our own, each with torch on one thread.
-
-    The filter is some thousand short operations. With torch's own threads each of them ends in a barrier of
-    OpenMP that spins, and on a machine that does something else as well a frame took 20 times as long as on
-    one thread.
-    """
-    torch_threads = torch.get_num_threads()
-    try:
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            for _ in pool.map(function, items):
-                pass
-    finally:
-        torch.set_num_threads(torch_threads)  # the number for threads that start later is shared by all
 
 
 def _guidance(color: torch.Tensor, albedo: torch.Tensor | None, normal: torch.Tensor | None) -> torch.Tensor:

@@ -16,14 +16,14 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from stopping import WARM_UP, Given, corrected, prepared
+from stopping import WARM_UP, Given, corrected, prepared, untrained
 from torch import Tensor
 
 from selfcorrect import Settings, metrics
 from selfcorrect.kernel.guides import Guides
 from selfcorrect.stages.core.loss import dual_buffer_loss, relative_weight, witnesses
 from selfcorrect.stages.core.network import Network
-from selfcorrect.stages.core.patches import overhang, steps_count
+from selfcorrect.stages.core.patches import steps_count
 from selfcorrect.stages.core.stage import Core
 from selfcorrect.stages.core.train import Adam
 from selfcorrect.stages.images import StageImages
@@ -70,14 +70,9 @@ class Drawn(Core):
 
     def run(self, state: StageImages, work: Work) -> Outcome:
         """Train, then infer."""
-        settings = self.settings
-        generator = torch.Generator().manual_seed(settings.seed)
-        size = (state.full.shape[0], state.full.shape[1])
-        margin = settings.window // 2 + overhang(size, settings)
-        a, b = (Guides.of_half(half._asdict(), margin=margin, scale=state.scale) for half in state.halves)
-        network = Network.for_guides(a, settings, generator)
-        self._train(network, (a, b), generator)
-        return Given(settings, network).run(state, work)
+        network, guides, generator = untrained(state, self.settings)
+        self._train(network, guides, generator)
+        return Given(self.settings, network).run(state, work)
 
     def _train(self, network: Network, guides: tuple[Guides, Guides], generator: torch.Generator) -> None:
         settings, patch = self.settings, (self.settings.patch, self.settings.patch)

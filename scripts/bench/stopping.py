@@ -140,6 +140,15 @@ class Average:
             mean.lerp_(weights, share)
 
 
+def untrained(state: StageImages, settings: Settings) -> tuple[Network, tuple[Guides, Guides], torch.Generator]:
+    """What training begins with: the network, the guides of both halves, whole, and the seeded generator."""
+    generator = torch.Generator().manual_seed(settings.seed)
+    size = (state.full.shape[0], state.full.shape[1])
+    margin = settings.window // 2 + overhang(size, settings)
+    a, b = (Guides.of_half(half._asdict(), margin=margin, scale=state.scale) for half in state.halves)
+    return Network.for_guides(a, settings, generator), (a, b), generator
+
+
 class Watched(Core):
     """The core, looked at now and then while it trains; what it gives is the last look's.
 
@@ -156,13 +165,7 @@ class Watched(Core):
 
     def run(self, state: StageImages, work: Work) -> Outcome:
         """Train, then infer."""
-        settings = self.settings
-        generator = torch.Generator().manual_seed(settings.seed)
-        size = (state.full.shape[0], state.full.shape[1])
-        margin = settings.window // 2 + overhang(size, settings)
-        a, b = (Guides.of_half(half._asdict(), margin=margin, scale=state.scale) for half in state.halves)
-        network = Network.for_guides(a, settings, generator)
-        self._train(network, (a, b), generator)
+        self._train(*untrained(state, self.settings))
         return Outcome(self._after(state, self.looks[-1].network, work.keep))
 
     def _train(self, network: Network, guides: tuple[Guides, Guides], generator: torch.Generator) -> None:

@@ -6,12 +6,13 @@ has already. At 8K bands of 128 rows took 24 MB for each map, which the system h
 """
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from selfcorrect.image.threads import in_threads
 
 __all__ = ["TILE", "average", "bands", "enlarged", "enlarged_rows", "in_bands", "shares", "tile_means", "widened"]
 
@@ -34,18 +35,8 @@ def bands(height: int, rows: int | None = None) -> Iterator[slice]:
 
 
 def in_bands(height: int, work: Callable[[slice], Made], rows: int | None = None) -> list[Made]:
-    """What ``work`` gives for each of :func:`bands`, in their order; as many bands at once as torch has threads.
-
-    A band is too small for torch's own threads: at 1920×1080 two of them took longer over the guard than one.
-    """
-    slices, threads = list(bands(height, rows)), torch.get_num_threads()
-    if threads == 1 or len(slices) == 1:
-        return [work(band) for band in slices]
-    try:
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(work, slices))
-    finally:
-        torch.set_num_threads(threads)  # each thread has a number of its own; this is what new ones begin with
+    """What ``work`` gives for each of :func:`bands`, in their order; as many bands at once as torch has threads."""
+    return in_threads(work, bands(height, rows))
 
 
 def widened(rows: slice, reach: int, height: int) -> tuple[slice, slice]:
